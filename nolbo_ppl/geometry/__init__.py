@@ -1,1 +1,1 @@
-
+"""Geometry: rotations and viewpoints, cameras, boxes, voxels."""

@@ -1,0 +1,42 @@
+"""Axis-aligned image boxes [x0, y0, x1, y1] in pixels: overlap and non-maximum suppression."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def box_area(box: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
+    """Area in square pixels; a reversed box has none."""
+    return (box[..., 2] - box[..., 0]).clamp_min(0) * (box[..., 3] - box[..., 1]).clamp_min(0)
+
+
+def box_iou(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
+    """Intersection over union of paired boxes (broadcast); two boxes without area have 0."""
+    corner_min = torch.maximum(a[..., :2], b[..., :2])
+    corner_max = torch.minimum(a[..., 2:], b[..., 2:])
+    intersection = (corner_max - corner_min).clamp_min(0).prod(-1)
+    union = box_area(a) + box_area(b) - intersection
+    return torch.where(union > 0, intersection / union.clamp_min(torch.finfo(a.dtype).tiny), torch.zeros_like(union))
+
+
+def pairwise_iou(a: Float[Tensor, "n 4"], b: Float[Tensor, "m 4"]) -> Float[Tensor, "n m"]:
+    """Intersection over union of every box of `a` with every box of `b`."""
+    return box_iou(a[:, None], b[None])
+
+
+def nms(
+    boxes: Float[Tensor, "n 4"], scores: Float[Tensor, " n"], iou_threshold: float = 0.5
+) -> Int[Tensor, " kept"]:
+    """Indices that greedy non-maximum suppression keeps, best score first.
+
+    A box goes when it overlaps a kept box of a higher score by more than `iou_threshold`.
+    """
+    order = torch.argsort(scores, descending=True, stable=True)
+    iou = pairwise_iou(boxes[order], boxes[order])
+    kept: list[int] = []
+    for i in range(len(order)):
+        if not kept or bool((iou[i, kept] <= iou_threshold).all()):
+            kept.append(i)
+    return order[torch.tensor(kept, dtype=torch.long)]
