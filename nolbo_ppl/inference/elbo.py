@@ -1,0 +1,233 @@
+"""The evidence lower bound of a scene, by name, and the inclusive objective beside it (method section 3).
+
+For each latent site of the guide the bound has one term, `-KL(q || p)`, analytic; for each observed site of the story
+one expected log likelihood, in closed form where the site carries one, else at the guide's sample. Discrete sites that
+the guide marks for enumeration (a missing category or instance) are summed out exactly: every later term is averaged
+under q(l | I), and the site's own KL is a finite sum.
+
+Names: `objectness`, `shape_kl`, `voxels`, `orientation_kl`, `rotation`, `box_kl`, `box`, `range_kl`, `range`, and where
+they occur `label_kl`, `instance_kl`, `instance_label_kl`. Each is a number in nats whose sum is the bound.
+The inclusive terms are `-KL(p(z | truth) || q(z | I))`, named `<latent>_inclusive`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from pyro import poutine
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import kl_divergence
+
+from nolbo_ppl.errors import NolboError, input_error
+
+KL_TERMS = {
+    "objectness": "objectness",
+    "label": "label_kl",
+    "instance": "instance_label_kl",
+    "shape_latent": "shape_kl",
+    "instance_latent": "instance_kl",
+    "orientation_latent": "orientation_kl",
+    "box_latent": "box_kl",
+    "range_latent": "range_kl",
+}
+"""Name of the KL term of each latent site."""
+
+LIKELIHOOD_TERMS = ("voxels", "rotation", "box", "range")
+"""Observed sites, whose term has the name of the site."""
+
+INCLUSIVE_TERMS = {
+    "objectness": "objectness_inclusive",
+    "label": "label_inclusive",
+    "shape_latent": "shape_inclusive",
+    "instance_latent": "instance_inclusive",
+    "orientation_latent": "orientation_inclusive",
+    "box_latent": "box_inclusive",
+    "range_latent": "range_inclusive",
+}
+"""Name of the inclusive term of each latent site whose truth can be known in training."""
+
+BOUND_TERMS = (*KL_TERMS.values(), *LIKELIHOOD_TERMS)
+"""Every term of the pure bound."""
+
+PURE_BOUND: dict[str, float] = dict.fromkeys(BOUND_TERMS, 1.0)
+"""Weights of the pure bound: its negative sum is the loss that `objective="elbo"` minimises."""
+
+PAPER: dict[str, float] = {**PURE_BOUND, "objectness": 0.0, "objectness_inclusive": 1.0}
+"""The paper's training loss: the bound, with the objectness KL turned round (binary cross-entropy up to a constant)."""
+
+INCLUSIVE: dict[str, float] = {
+    "objectness_inclusive": 1.0,
+    "label_inclusive": 1.0,
+    "shape_inclusive": 0.25,
+    "orientation_inclusive": 1.0,
+    "box_inclusive": 0.5,
+    "range_inclusive": 0.5,
+}
+"""The default objective: the inclusive KL wherever the truth of a latent is known in training."""
+
+
+@dataclass
+class ElboResult:
+    """The terms of one evaluation, summed over regions and objects of the batch, in nats (a term to be maximised)."""
+
+    terms: dict[str, Tensor]
+    """By name; terms of weight zero are missing unless they were asked for."""
+    loss: Tensor
+    """Weighted negative sum, divided by the number of scenes."""
+
+
+class SceneElbo:
+    """Bound and inclusive terms of a model and guide, through their Pyro traces.
+
+    Args:
+        weights: weight of each term in the loss, by name (see the module's docstring); others have weight 0.
+
+    Raises:
+        InputError: a weight has an unknown name or is not a finite number.
+    """
+
+    def __init__(self, weights: Mapping[str, float] = PURE_BOUND) -> None:
+        known = {*BOUND_TERMS, *INCLUSIVE_TERMS.values()}
+        unknown = sorted(set(weights) - known)
+        if unknown:
+            raise input_error("unknown term of the bound", got=unknown, expected=f"names among {sorted(known)}")
+        for name, weight in weights.items():
+            if not torch.isfinite(torch.tensor(float(weight))):
+                raise input_error(f"weight of {name}", got=weight, expected="a finite number")
+        self.weights = {name: float(weight) for name, weight in weights.items() if weight != 0}
+
+    def evaluate(
+        self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, scenes: int = 1, **kwargs: Any
+    ) -> ElboResult:
+        """Loss and weighted terms of one run of guide and model.
+
+        Args:
+            model: the story, called as `model(*args, **kwargs)`.
+            guide: the guide, called as `guide(*args)`.
+            *args: what both are run on.
+            scenes: number of scenes of the batch; the loss is the mean over scenes.
+            **kwargs: further arguments of the model.
+        """
+        terms = self.terms(model, guide, *args, names=set(self.weights), **kwargs)
+        total = sum((self.weights[name] * value for name, value in terms.items()), torch.zeros(()))
+        return ElboResult(terms, -torch.as_tensor(total) / scenes)
+
+    def terms(
+        self,
+        model: Callable[..., Any],
+        guide: Callable[..., Any],
+        *args: Any,
+        names: set[str] | None = None,
+        **kwargs: Any,
+    ) -> dict[str, Tensor]:
+        """Terms by name; without `names` those of the pure bound, whose sum is the bound itself.
+
+        Raises:
+            NolboError: guide and story do not have the same latent sites.
+        """
+        wanted = set(BOUND_TERMS) if names is None else names
+        guide_trace = poutine.trace(poutine.enum(guide, first_available_dim=-3)).get_trace(*args)
+        model_trace = poutine.trace(poutine.replay(model, trace=guide_trace)).get_trace(*args, **kwargs)
+        self._check_sites(model_trace, guide_trace)
+        enumerated = _enumerated(guide_trace)
+        terms: dict[str, Tensor] = {}
+        for name, site in model_trace.nodes.items():
+            if site["type"] != "sample" or name not in (*KL_TERMS, *LIKELIHOOD_TERMS):
+                continue
+            if name in LIKELIHOOD_TERMS:
+                if name in wanted:
+                    terms[name] = _reduce(_log_likelihood(site, guide_trace), site, site["mask"], enumerated)
+                continue
+            q = guide_trace.nodes.get(name)
+            if q is None:
+                continue
+            if KL_TERMS[name] in wanted and not q["is_observed"]:
+                kl = _enumerated_kl(site, q) if name in enumerated else kl_divergence(q["fn"], site["fn"])
+                skip = name if name in enumerated else None
+                terms[KL_TERMS[name]] = -_reduce(kl, site, site["mask"], enumerated, skip)
+            truth = site["infer"].get("truth")
+            if truth is not None and INCLUSIVE_TERMS.get(name) in wanted:
+                divergence = kl_divergence(truth, q["infer"].get("posterior", q["fn"]))
+                mask = site["infer"].get("truth_mask", site["mask"])
+                terms[INCLUSIVE_TERMS[name]] = -_reduce(divergence, site, mask, {})
+        return terms
+
+    @staticmethod
+    def _check_sites(model_trace: poutine.Trace, guide_trace: poutine.Trace) -> None:
+        latent = {n for n, s in model_trace.nodes.items() if s["type"] == "sample" and not s["is_observed"]} & set(KL_TERMS)
+        guided = {n for n, s in guide_trace.nodes.items() if s["type"] == "sample" and not s["is_observed"]} & set(KL_TERMS)
+        if latent != guided:
+            raise NolboError(
+                f"story and guide disagree about latent sites: only in the story {sorted(latent - guided)}, "
+                f"only in the guide {sorted(guided - latent)}"
+            )
+
+
+def _enumerated(guide_trace: poutine.Trace) -> dict[str, tuple[int, Tensor]]:
+    """Dimension and probabilities q(value) of each enumerated site of the guide, dimension counted from the right."""
+    found = {}
+    for name, site in guide_trace.nodes.items():
+        if site["type"] == "sample" and site["infer"].get("_enumerate_dim") is not None:
+            found[name] = (site["infer"]["_enumerate_dim"], site["fn"].log_prob(site["value"]).exp())
+    return found
+
+
+def _enumerated_kl(model_site: dict[str, Any], guide_site: dict[str, Any]) -> Tensor:
+    """sum_l q(l) (log q(l) - log p(l)), values of probability zero contributing nothing."""
+    q: TorchDistribution = guide_site["fn"]
+    log_q, log_p = q.log_prob(guide_site["value"]), model_site["fn"].log_prob(guide_site["value"])
+    probability = log_q.exp()
+    positive = probability > 0
+    dim = guide_site["infer"]["_enumerate_dim"]
+    difference = torch.where(positive, log_q, 0.0) - torch.where(positive, log_p, 0.0)
+    return (probability * difference).sum(dim, keepdim=True)
+
+
+def _log_likelihood(site: dict[str, Any], guide_trace: poutine.Trace) -> Tensor:
+    """Expected log likelihood in closed form where the site has one, else at the sample."""
+    closed_form = site["infer"].get("expected_log_prob")
+    if closed_form is None:
+        return site["fn"].log_prob(site["value"])
+    latent, expectation = closed_form
+    return expectation(guide_trace.nodes[latent]["fn"])
+
+
+def _reduce(
+    value: Tensor,
+    site: dict[str, Any],
+    mask: Tensor | bool | None,
+    enumerated: Mapping[str, tuple[int, Tensor]],
+    skip: str | None = None,
+) -> Tensor:
+    """Average over enumerated sites, mask, scale, sum."""
+    for name, (dim, probability) in sorted(enumerated.items(), key=lambda item: item[1][0]):
+        if name != skip and value.dim() >= -dim and value.shape[dim] > 1:
+            positive = probability > 0
+            value = torch.where(positive, probability * torch.where(positive, value, 0.0), 0.0).sum(dim, keepdim=True)
+    if mask is not None:
+        value = torch.where(torch.as_tensor(mask), value, torch.zeros((), dtype=value.dtype))
+    return (value * site["scale"]).sum()
+
+
+class SceneLoss(torch.nn.Module):
+    """Loss of a batch as one module: what a trainer, or a distributed wrapper of it, calls.
+
+    Args:
+        story: the generative model.
+        guide: its guide; a module with `observe(batch)`.
+        elbo: the weighted terms.
+    """
+
+    def __init__(self, story: torch.nn.Module, guide: torch.nn.Module, elbo: SceneElbo) -> None:
+        super().__init__()
+        self.story, self.guide, self.elbo = story, guide, elbo
+
+    def forward(self, batch: Any, decode: int | None = 0) -> ElboResult:
+        """Encode the batch, find the responsible regions, and evaluate the objective."""
+        scene = self.guide.observe(batch)  # type: ignore[operator]
+        return self.elbo.evaluate(self.story, self.guide, scene, scenes=len(batch.image), decode=decode)
+

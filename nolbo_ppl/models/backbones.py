@@ -1,0 +1,127 @@
+"""Image encoders: the whole scene goes in once, the features of every cell come out."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.normalisation import SyncBatchNorm2d
+
+
+class ConvUnit(nn.Sequential):
+    """Convolution, batch normalisation, leaky ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
+        super().__init__(
+            nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False),
+            SyncBatchNorm2d(outputs),
+            nn.LeakyReLU(0.1, inplace=True),
+        )
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions beside the identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = ConvUnit(channels, channels, 3)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm = SyncBatchNorm2d(channels)
+        self.activation = nn.LeakyReLU(0.1, inplace=True)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Add the two convolutions to the input."""
+        return self.activation(self.norm(self.second(self.first(x))) + x)
+
+
+class Encoder(Protocol):
+    """What the guide asks of an encoder."""
+
+    stride: int
+    channels: int
+
+    def __call__(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c gh gw"]:
+        """Features of every cell."""
+        ...
+
+
+class TinyEncoder(nn.Module):
+    """A small residual network of stride 16; the finer stride-8 features are folded into the channels of each cell.
+
+    Without the folded features small objects lose their box accuracy (method: findings on learning).
+    """
+
+    stride = 16
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        c2, c4, c8, c16 = config.encoder_channels
+        n4, n8, n16 = config.encoder_blocks
+        self.stem = nn.Sequential(ConvUnit(3, c2, 3, 2), ConvUnit(c2, c4, 3, 2), *(ResidualBlock(c4) for _ in range(n4)))
+        self.middle = nn.Sequential(ConvUnit(c4, c8, 3, 2), *(ResidualBlock(c8) for _ in range(n8)))
+        self.deep = nn.Sequential(ConvUnit(c8, c16, 3, 2), *(ResidualBlock(c16) for _ in range(n16)))
+        self.fold = nn.PixelUnshuffle(2)
+        self.channels = c16 + 4 * c8
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c gh gw"]:
+        """Features of each 16 x 16 px cell."""
+        middle = self.middle(self.stem(image))
+        return torch.cat((self.deep(middle), self.fold(middle)), dim=1)
+
+
+_DARKNET19: tuple[tuple[tuple[int, int], ...], ...] = (
+    ((32, 3),),
+    ((64, 3),),
+    ((128, 3), (64, 1), (128, 3)),
+    ((256, 3), (128, 1), (256, 3)),
+    ((512, 3), (256, 1), (512, 3), (256, 1), (512, 3)),
+    ((1024, 3), (512, 1), (1024, 3), (512, 1), (1024, 3)),
+)
+"""(channels, kernel) of the 18 convolutions of darknet19's core (YOLO9000, table 6), by stage between the poolings."""
+
+
+class Darknet19Encoder(nn.Module):
+    """The paper's encoder: darknet19's 18 convolutions, then three 3 x 3 convolutions of 1024 channels; stride 32."""
+
+    stride = 32
+    channels = 1024
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        inputs = 3
+        for index, stage in enumerate(_DARKNET19):
+            if index:
+                layers.append(nn.MaxPool2d(2))
+            for outputs, kernel in stage:
+                layers.append(ConvUnit(inputs, outputs, kernel))
+                inputs = outputs
+        self.core = nn.Sequential(*layers)
+        self.neck = nn.Sequential(*(ConvUnit(1024, 1024, 3) for _ in range(3)))
+
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1024 gh gw"]:
+        """Features of each 32 x 32 px cell; the first pooling follows the first convolution, the last the fifth stage."""
+        return self.neck(self.core(image))
+
+
+def make_encoder(config: ModelConfig) -> TinyEncoder | Darknet19Encoder:
+    """The encoder a configuration names."""
+    return TinyEncoder(config) if config.encoder == "tiny" else Darknet19Encoder()
+
+
+def check_image(image: Tensor) -> None:
+    """Raise `InputError` unless `image` is uint8 [b, 3, h, w] or float in [0, 255] with sides that are multiples of 32."""
+    if image.dim() != 4 or image.shape[1] != 3:
+        raise input_error("an image batch of the wrong shape", got=tuple(image.shape), expected="(b, 3, height, width)")
+    if image.shape[2] % 32 or image.shape[3] % 32 or 0 in image.shape[2:]:
+        raise input_error("an image side", got=tuple(image.shape[2:]), expected="positive multiples of 32", do="resize or pad it")
+
+
+def normalise_image(image: Tensor, dtype: torch.dtype) -> Float[Tensor, "b 3 h w"]:
+    """Colours from 0..255 to about unit variance about zero."""
+    return (image.to(dtype) - 127.5) / 64.0

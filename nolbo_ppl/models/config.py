@@ -1,0 +1,144 @@
+"""Configuration of the generative story and its guide, and the presets `tiny` and `paper`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
+from nolbo_ppl.errors import input_error
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Everything that fixes the shape of the networks and the constants of the story."""
+
+    categories: tuple[str, ...] = CATEGORIES
+    """Names of the object categories, in the order of their labels."""
+    symmetry: tuple[int, ...] = tuple(CATEGORY_SYMMETRY.values())
+    """Declared symmetry about the vertical axis by category: 1 none, n for n-fold, 0 free."""
+    instances: tuple[str, ...] = ()
+    """Names of the instances with labels of their own; empty for a latent of categories only."""
+    instance_category: tuple[int, ...] = ()
+    """Category label of each instance."""
+    encoder: Literal["tiny", "darknet19"] = "tiny"
+    """Image encoder: a small residual network of stride 16 for CPUs, or the paper's darknet19 of stride 32."""
+    encoder_channels: tuple[int, int, int, int] = (24, 48, 96, 144)
+    """Channels of the tiny encoder at strides 2, 4, 8 and 16."""
+    encoder_blocks: tuple[int, int, int] = (1, 2, 3)
+    """Residual blocks of the tiny encoder at strides 4, 8 and 16."""
+    head_width: int = 384
+    """Width of the head's hidden layers (tiny encoder only; darknet19 has a linear head as the paper)."""
+    predictors: int = 2
+    """Predictors P of each cell; a scene of G x G cells has K = G G P regions."""
+    image_size: int = 128
+    """Side in pixels of the images it is trained on, a multiple of 32. Other multiples of 32 work as well."""
+    latent_dim: int = 16
+    """Dimensions of the shape latent; with instance labels half of them describe the category, half the instance."""
+    prior_width: int = 64
+    """Width of the hidden layer of each prior network."""
+    voxel_size: Literal[32, 64] = 32
+    """Voxels along each side of the decoded grid."""
+    decoder_channels: tuple[int, ...] = (128, 64, 32)
+    """Channels of the decoder from its 4^3 grid on; each transposed convolution doubles the grid."""
+    voxel_encoder_channels: tuple[int, ...] = (16, 32, 64)
+    """Channels of the 3D encoder of the shape autoencoder; each convolution halves the grid."""
+    orientation: Literal["mixture", "angle", "sincos"] = "mixture"
+    """Form of the orientation latent: a mixture of von Mises azimuths, one wrapped normal an angle, or the paper's
+    factorised Gaussian on (sin, cos)."""
+    azimuth_components: int = 4
+    """Modes of the azimuth mixture."""
+    max_concentration: float = 300.0
+    """Largest von Mises concentration of a mode (its scale is then 0.058 rad, close to the story's 0.05)."""
+    orientation_scale: float = 0.05
+    """Scale in rad of the story's orientation latent about the true viewpoint."""
+    rotation_concentration: float = 200.0
+    """Matrix-Fisher concentration of the observed rotation; 200 stands for a scale of 0.05 rad."""
+    objectness_epsilon: float = 1e-3
+    """p(o = 0 | object) = p(o = 1 | background) of the story."""
+    box_loc: tuple[float, float, float, float] = (0.0, 0.0, 0.9, 0.9)
+    """Affine map of the box latent, shift: (centre offset / stride, log size / stride)."""
+    box_spread: tuple[float, float, float, float] = (0.3, 0.3, 0.8, 0.8)
+    """Affine map of the box latent, factor."""
+    box_scale: float = 0.05
+    """Scale of the observed box about its latent, in latent units."""
+    range_loc: tuple[float, float, float, float] = (-3.0, 0.0, 0.0, 0.8)
+    """Affine map of the range latent, shift: (log(range / focal length), offset of the projected centre from the box's
+    centre in box sizes, log diagonal in m)."""
+    range_spread: tuple[float, float, float, float] = (1.2, 0.15, 0.15, 1.2)
+    """Affine map of the range latent, factor."""
+    range_scale: float = 0.02
+    """Scale of the observed range, direction and size about their latent, in latent units."""
+
+    def __post_init__(self) -> None:
+        if len(self.symmetry) != len(self.categories):
+            raise input_error("one symmetry per category is needed", got=len(self.symmetry), expected=len(self.categories))
+        if len(set(self.categories)) != len(self.categories) or not self.categories:
+            raise input_error("category names must be unique", got=self.categories, expected="at least one, no duplicates")
+        if len(self.instance_category) != len(self.instances):
+            raise input_error(
+                "one category per instance is needed", got=len(self.instance_category), expected=len(self.instances)
+            )
+        if self.instances and self.latent_dim % 2:
+            raise input_error("a latent split in two halves", got=self.latent_dim, expected="an even latent_dim")
+        if self.image_size % 32 or self.image_size <= 0:
+            raise input_error("image_size", got=self.image_size, expected="a positive multiple of 32")
+        if 4 * 2 ** len(self.decoder_channels) != self.voxel_size:
+            raise input_error(
+                "decoder_channels do not reach the voxel grid", got=f"{len(self.decoder_channels)} for {self.voxel_size}",
+                expected="one channel count per doubling of a 4^3 grid",
+            )
+        if not 0 < self.objectness_epsilon < 0.5:
+            raise input_error("objectness_epsilon", got=self.objectness_epsilon, expected="a number in (0, 0.5)")
+
+    @property
+    def stride(self) -> int:
+        """Pixels of a cell's side."""
+        return 16 if self.encoder == "tiny" else 32
+
+    @property
+    def category_dim(self) -> int:
+        """Dimensions of the latent that describe the category."""
+        return self.latent_dim // 2 if self.instances else self.latent_dim
+
+    @property
+    def instance_dim(self) -> int:
+        """Dimensions of the latent that describe the instance; 0 without instance labels."""
+        return self.latent_dim - self.category_dim
+
+    def to_json(self) -> dict[str, Any]:
+        """As a dictionary that JSON can hold."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> ModelConfig:
+        """From `to_json`'s dictionary. Raises `InputError` naming an unknown field."""
+        names = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - names)
+        if unknown:
+            raise input_error("unknown model configuration", got=unknown, expected=f"fields among {sorted(names)}")
+        return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+
+
+def tiny() -> ModelConfig:
+    """The default for CPUs: 1.5 M parameters, 128 px, 32^3 voxels."""
+    return ModelConfig()
+
+
+def paper() -> ModelConfig:
+    """The paper's network: darknet19, one orientation mode, 64^3 voxels, 448 px."""
+    return ModelConfig(
+        encoder="darknet19",
+        image_size=448,
+        voxel_size=64,
+        decoder_channels=(512, 256, 128, 64),
+        voxel_encoder_channels=(64, 128, 256, 512),
+        orientation="angle",
+        azimuth_components=1,
+        max_concentration=400.0,
+    )
+
+
+PRESETS = {"tiny": tiny, "paper": paper}
+"""The named configurations."""

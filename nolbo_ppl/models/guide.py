@@ -1,0 +1,227 @@
+"""The amortised guide q(o, l, z | I): the whole scene goes in once, every region's posterior comes out (NOLBO fig. 2c)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Float, Int
+from pyro import poutine
+from pyro.nn import PyroModule
+from torch import Tensor
+
+from nolbo_ppl.geometry.boxes import box_iou
+from nolbo_ppl.models.backbones import check_image, make_encoder, normalise_image
+from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.distributions import (
+    NoisyNormal,
+    Objectness,
+    ViewpointMixture,
+    ViewpointNormal,
+    ViewpointSinCos,
+    kl_to_each_component,
+)
+from nolbo_ppl.models.head import RegionHead, RegionParameters
+from nolbo_ppl.models.prior import LabelPrior
+from nolbo_ppl.models.scene import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
+
+
+@dataclass
+class Encoding:
+    """What the encoder made of a batch of images."""
+
+    features: Float[Tensor, "b cells c"]
+    """Features of each cell."""
+    objectness_logit: Float[Tensor, "b k"]
+    """Log odds of q(o | I) of every region; region = cell * predictors + predictor."""
+    rows: int
+    columns: int
+
+
+@dataclass
+class ObservedScene:
+    """A batch with its encoding, its responsible regions and their posterior: what story and guide are run on."""
+
+    batch: SceneBatch
+    encoding: Encoding
+    assignment: Assignment
+    posterior: RegionParameters
+
+
+def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> dist.TorchDistribution:
+    """q(z^v | I) in the configured form: a mixture over azimuths, one mode, or the paper's factorised (sin, cos)."""
+    if config.orientation == "mixture":
+        return ViewpointMixture(
+            parameters.azimuth_logits, parameters.azimuth_natural, parameters.angle_loc, parameters.angle_scale,
+            max_concentration=config.max_concentration,
+        )  # fmt: skip
+    natural = parameters.azimuth_natural[..., 0, :]
+    concentration = torch.linalg.vector_norm(natural, dim=-1).clamp(1e-3, config.max_concentration)
+    loc = torch.cat((torch.atan2(natural[..., 1], natural[..., 0])[..., None], parameters.angle_loc), -1)
+    scale = torch.cat((torch.rsqrt(concentration)[..., None], parameters.angle_scale), -1)
+    return ViewpointNormal(loc, scale) if config.orientation == "angle" else ViewpointSinCos(loc, scale)
+
+
+class Guide(PyroModule):
+    """Encoder and head, and the Pyro guide they amortise."""
+
+    def __init__(self, config: ModelConfig, prior: LabelPrior) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = make_encoder(config)
+        self.head = RegionHead(self.encoder.channels, config)
+        self._prior: Callable[[], LabelPrior] = lambda: prior  # owned by the story, shared here
+
+    def encode(self, image: Tensor) -> Encoding:
+        """Run the encoder on whole images, uint8 or float in 0..255, sides multiples of 32.
+
+        Raises:
+            InputError: the image batch has the wrong shape or sides.
+        """
+        check_image(image)
+        dtype = self.head.objectness.weight.dtype
+        x = normalise_image(image, dtype)
+        if dtype == torch.float32:  # faster convolutions on CPUs
+            x = x.contiguous(memory_format=torch.channels_last)
+        maps = self.encoder(x)
+        features = maps.flatten(2).transpose(1, 2)
+        logit = self.head.objectness(features).flatten(1)
+        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3])
+
+    def region_parameters(
+        self, encoding: Encoding, cell: Int[Tensor, "b m"], predictor: Int[Tensor, "b m"]
+    ) -> RegionParameters:
+        """Posterior parameters of given regions."""
+        return self.head.parameters_of(_select(self._raw(encoding, cell), predictor), self._prior().label_mean())
+
+    def _raw(self, encoding: Encoding, cell: Int[Tensor, "b m"]) -> Float[Tensor, "b m predictors outputs"]:
+        index = cell[..., None].expand(-1, -1, encoding.features.shape[-1])
+        dtype = self.head.objectness.weight.dtype
+        return self.head(torch.gather(encoding.features, 1, index)).to(dtype)
+
+    def observe(self, batch: SceneBatch) -> ObservedScene:
+        """Encode a batch and find the responsible region of each object."""
+        encoding = self.encode(batch.image)
+        stride, columns = self.config.stride, encoding.columns
+        cell = cell_of(batch.box, encoding.rows, columns, stride)
+        raw = self._raw(encoding, cell)
+        with torch.no_grad():
+            start = sum(self.head.sizes[:4])
+            boxes = decode_box(
+                raw[..., start : start + 4], cell[..., None].expand(raw.shape[:3]), columns, self.config
+            )
+            iou = box_iou(boxes, batch.box[:, :, None])
+            predictor, assigned = assign_predictors(cell, iou, batch.present)
+            region = cell * self.config.predictors + predictor
+            regions = encoding.objectness_logit.shape[1]
+            is_object = torch.zeros(len(cell), regions + 1, dtype=torch.bool)  # the last column takes the rest
+            is_object.scatter_(1, torch.where(assigned, region, regions), True)
+            has_range = batch.has_position & batch.has_size
+            safe_position = torch.where(has_range[..., None], batch.position, batch.position.new_tensor([0.0, 0.0, 1.0]))
+            assignment = Assignment(
+                cell=cell,
+                predictor=predictor,
+                assigned=assigned,
+                is_object=is_object[:, :regions],
+                box_target=encode_box(batch.box, cell, columns, self.config),
+                range_target=encode_range(
+                    safe_position,
+                    torch.where(has_range, batch.diagonal, torch.ones_like(batch.diagonal)),
+                    batch.box,
+                    batch.intrinsics[:, None].expand(-1, batch.box.shape[1], -1),
+                    self.config,
+                ),
+                has_range=has_range,
+            )
+        posterior = self.head.parameters_of(_select(raw, predictor), self._prior().label_mean())
+        return ObservedScene(batch, encoding, assignment, posterior)
+
+    def forward(self, scene: ObservedScene) -> None:
+        """The Pyro guide: the sites of `Story`, amortised."""
+        batch, q, assigned = scene.batch, scene.posterior, scene.assignment.assigned
+        scenes = pyro.plate("scenes", assigned.shape[0], dim=-2)
+        with scenes, pyro.plate("regions", scene.encoding.objectness_logit.shape[1], dim=-1):
+            pyro.sample("objectness", Objectness(logits=scene.encoding.objectness_logit))
+        with scenes, pyro.plate("objects", assigned.shape[1], dim=-1), poutine.mask(mask=assigned):
+            label = self._label(batch, q)
+            latent = self._prior().category_dim
+            noise = batch.noise
+            pyro.sample(
+                "shape_latent",
+                NoisyNormal(
+                    q.shape_loc[..., :latent], q.shape_scale[..., :latent], None if noise is None else noise[..., :latent]
+                ).to_event(1),
+            )
+            if self._prior().instance is not None:
+                self._instance(batch, q, label)
+                pyro.sample(
+                    "instance_latent",
+                    NoisyNormal(
+                        q.shape_loc[..., latent:], q.shape_scale[..., latent:],
+                        None if noise is None else noise[..., latent:],
+                    ).to_event(1),
+                )  # fmt: skip
+            with poutine.mask(mask=batch.has_viewpoint):
+                pyro.sample("orientation_latent", orientation_posterior(q, self.config))
+            pyro.sample("box_latent", dist.Normal(q.box_loc, q.box_scale).to_event(1))
+            with poutine.mask(mask=scene.assignment.has_range):
+                pyro.sample("range_latent", dist.Normal(q.range_loc, q.range_scale).to_event(1))
+
+    def _label(self, batch: SceneBatch, q: RegionParameters) -> Tensor:
+        """q(l | I): observed where the label is known; where it is missing the head's probabilities, enumerated."""
+        posterior = dist.Categorical(logits=q.label_logits)
+        missing = batch.category < 0
+        category = batch.category.clamp_min(0)
+        if not bool((missing & batch.present).any()):
+            return pyro.sample("label", posterior, obs=category)
+        known = torch.nn.functional.one_hot(category, q.label_logits.shape[-1]).to(q.label_logits)
+        probability = torch.where(missing[..., None], posterior.probs, known)
+        infer = {"enumerate": "parallel", "posterior": posterior}
+        return pyro.sample("label", dist.Categorical(probability), infer=infer)
+
+    def _instance(self, batch: SceneBatch, q: RegionParameters, label: Tensor) -> None:
+        """q(i | l, I) where an instance is missing: the exact maximiser of the bound, proportional to p(i | l) exp(-KL_i)."""
+        prior = self._prior()
+        missing = batch.instance < 0
+        if not bool((missing & batch.present).any()):
+            return
+        latent = prior.category_dim
+        kl = kl_to_each_component(q.shape_loc[..., latent:], q.shape_scale[..., latent:], prior.instance_mean())
+        posterior = torch.softmax(prior.instance_log_probability(label) - kl, -1)
+        known = torch.nn.functional.one_hot(batch.instance.clamp_min(0), posterior.shape[-1]).to(posterior)
+        probability = torch.where(missing[..., None], posterior, known)
+        pyro.sample("instance", dist.Categorical(probability), infer={"enumerate": "parallel"})
+
+
+def _select(raw: Float[Tensor, "b m p o"], predictor: Int[Tensor, "b m"]) -> Float[Tensor, "b m o"]:
+    index = predictor[..., None, None].expand(-1, -1, 1, raw.shape[-1])
+    return torch.gather(raw, 2, index).squeeze(2)
+
+
+def assign_predictors(
+    cell: Int[Tensor, "b m"], iou: Float[Tensor, "b m p"], present: Tensor
+) -> tuple[Int[Tensor, "b m"], Tensor]:
+    """Responsible predictor of each object: in its cell, the free one with the highest IoU (method section 1).
+
+    Objects choose in the order of their best IoU, so that two objects of one cell get different predictors; an object
+    that finds none free is left out (second result false).
+    """
+    b, m, p = iou.shape
+    order = torch.where(present, iou.max(-1).values, iou.new_tensor(-1.0)).argsort(1, descending=True, stable=True)
+    taken = torch.zeros(b, m, p, dtype=torch.bool)  # predictors already taken in the cell of each object
+    predictor = torch.zeros(b, m, dtype=torch.long)
+    assigned = torch.zeros(b, m, dtype=torch.bool)
+    rows = torch.arange(b)
+    same_cell = cell[:, :, None] == cell[:, None, :]
+    for rank in range(m):
+        slot = order[:, rank]
+        score = torch.where(taken[rows, slot], -1.0, iou[rows, slot])
+        best = score.argmax(-1)
+        free = present[rows, slot] & (score[rows, best] >= 0)
+        predictor[rows, slot] = best
+        assigned[rows, slot] = free
+        taken |= (same_cell[rows, slot] & free[:, None])[..., None] & (torch.arange(p) == best[:, None])[:, None]
+    return predictor, assigned

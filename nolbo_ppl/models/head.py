@@ -1,0 +1,112 @@
+"""The head of the guide: features of a cell -> parameters of the posterior of each of its predictors."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.shape import bounded_exp
+
+
+@dataclass
+class RegionParameters:
+    """Parameters of q(. | I) of regions, any batch shape; latent units where not said otherwise."""
+
+    label_logits: Float[Tensor, "*n labels"]
+    """Log probabilities, up to a constant, of the category."""
+    shape_loc: Float[Tensor, "*n d"]
+    """Mean of the shape latent."""
+    shape_scale: Float[Tensor, "*n d"]
+    """Scale of the shape latent."""
+    azimuth_logits: Float[Tensor, "*n modes"]
+    """Log weights, up to a constant, of the azimuth's modes."""
+    azimuth_natural: Float[Tensor, "*n modes 2"]
+    """Natural parameters kappa (cos, sin) of each mode."""
+    angle_loc: Float[Tensor, "*n 2"]
+    """Mean elevation and in-plane rotation, rad."""
+    angle_scale: Float[Tensor, "*n 2"]
+    """Their scales, rad."""
+    box_loc: Float[Tensor, "*n 4"]
+    """Mean of the box latent."""
+    box_scale: Float[Tensor, "*n 4"]
+    """Scale of the box latent."""
+    range_loc: Float[Tensor, "*n 4"]
+    """Mean of the range latent."""
+    range_scale: Float[Tensor, "*n 4"]
+    """Scale of the range latent."""
+
+    def map(self, function) -> RegionParameters:  # noqa: ANN001
+        """Apply a function to every tensor."""
+        return RegionParameters(**{f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self)})
+
+
+class RegionHead(nn.Module):
+    """Features -> objectness of every region, and the raw outputs of the regions that are asked for.
+
+    The small encoder has a hidden part (two layers with layer norm), run only where it is wanted: a scene has far more
+    cells than objects. darknet19 has the paper's linear 1 x 1 head without bias.
+    """
+
+    def __init__(self, channels: int, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        d, modes = config.latent_dim, config.azimuth_components
+        self.sizes = (len(config.categories), 2 * d, 3 * modes, 4, 8, 8)
+        outputs = config.predictors * sum(self.sizes)
+        linear = config.encoder == "darknet19"
+        self.objectness = nn.Linear(channels, config.predictors, bias=not linear)
+        width = config.head_width
+        self.outputs = (
+            nn.Linear(channels, outputs, bias=False)
+            if linear
+            else nn.Sequential(
+                nn.Linear(channels, width), nn.LayerNorm(width), nn.GELU(),
+                nn.Linear(width, width), nn.LayerNorm(width), nn.GELU(),
+                nn.Linear(width, outputs),
+            )
+        )  # fmt: skip
+        if not linear:
+            nn.init.constant_(self.objectness.bias, -4.0)
+            nn.init.normal_(self.outputs[-1].weight, std=0.02)
+        # The modes of the azimuth start at concentration 1, spread evenly: 0, 90, 180 and 270 degrees for four.
+        angle = torch.arange(modes) * (2 * math.pi / modes)
+        self.register_buffer("natural_start", torch.stack((torch.cos(angle), torch.sin(angle)), -1), persistent=False)
+
+    def forward(self, features: Float[Tensor, "*n c"]) -> Float[Tensor, "*n predictors outputs"]:
+        """Raw outputs of every predictor of each cell."""
+        return self.outputs(features).unflatten(-1, (self.config.predictors, sum(self.sizes)))
+
+    def parameters_of(
+        self, raw: Float[Tensor, "*n outputs"], prior_mean: Float[Tensor, "labels d"]
+    ) -> RegionParameters:
+        """Posterior parameters of raw outputs.
+
+        The mean of the shape latent is the expected prior mean under the category's probabilities plus a residual: the
+        network then only has to learn what sets an instance apart from its category.
+        """
+        label, shape, azimuth, angle, box, range_ = raw.split(self.sizes, -1)
+        residual, shape_raw = shape.chunk(2, -1)
+        modes = self.config.azimuth_components
+        natural = azimuth[..., modes:].unflatten(-1, (modes, 2)) * 8 + self.natural_start.to(raw.dtype)
+        angle_loc, angle_raw = angle.chunk(2, -1)
+        box_loc, box_raw = box.chunk(2, -1)
+        range_loc, range_raw = range_.chunk(2, -1)
+        return RegionParameters(
+            label_logits=label,
+            shape_loc=torch.softmax(label, -1) @ prior_mean.to(raw.dtype) + 2 * residual,
+            shape_scale=bounded_exp(shape_raw, -4.0, 2.0),
+            azimuth_logits=azimuth[..., :modes],
+            azimuth_natural=natural,
+            angle_loc=angle_loc,
+            angle_scale=0.3 * bounded_exp(angle_raw, -3.0, 1.5),
+            box_loc=box_loc,
+            box_scale=0.3 * bounded_exp(box_raw, -5.0, 3.0),
+            range_loc=range_loc,
+            range_scale=0.3 * bounded_exp(range_raw, -5.0, 3.0),
+        )

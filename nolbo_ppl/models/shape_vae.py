@@ -1,0 +1,75 @@
+"""The shape autoencoder of the first stage: prior network, decoder and a 3D encoder, as a Pyro model and guide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Float, Int, UInt8
+from pyro.nn import PyroModule
+from torch import Tensor
+
+from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.distributions import NoisyNormal
+from nolbo_ppl.models.scene import unpack_bits
+from nolbo_ppl.models.shape import VoxelEncoder
+from nolbo_ppl.models.story import Story, voxel_site
+
+
+@dataclass
+class ShapeBatch:
+    """Voxels with their labels."""
+
+    voxels: UInt8[Tensor, "n bytes"]
+    """Canonical voxels, packed bits in C order."""
+    category: Int[Tensor, " n"]
+    """Category label."""
+    instance: Int[Tensor, " n"]
+    """Instance label, -1 for none of the known ones."""
+    noise: Float[Tensor, "n d"] | None = None
+    """Standard normal noise of the latent's sample."""
+
+
+class ShapeStory(torch.nn.Module):
+    """The part of the story that makes voxels from labels; shares prior and decoder with the story of scenes."""
+
+    def __init__(self, story: Story) -> None:
+        super().__init__()
+        self.story = story
+
+    def forward(self, batch: ShapeBatch) -> None:
+        """p(z | l) p(voxels | z) of each shape; an instance of -1 is "novel" here, the prior's zero mean."""
+        prior, size = self.story.prior, self.story.config.voxel_size
+        with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(batch.voxels), dim=-1):
+            mean = prior.category_mean()[batch.category][None]
+            if prior.instance is not None:
+                instance = torch.where(batch.instance < 0, len(prior.instance_category), batch.instance)
+                mean = torch.cat((mean, prior.instance_mean()[instance][None]), -1)
+            latent = pyro.sample("shape_latent", dist.Normal(mean, torch.ones_like(mean)).to_event(1))
+        logits = self.story.decoder(latent[0])
+        voxel_site(logits, unpack_bits(batch.voxels, size).to(logits.dtype))
+
+
+class ShapeGuide(PyroModule):
+    """q(z | true shape): the teacher of the image guide."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = VoxelEncoder(config)
+
+    def posterior(self, packed: UInt8[Tensor, "n bytes"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
+        """Mean and scale of the latent of each packed grid."""
+        dtype = self.encoder.dense.weight.dtype
+        return self.encoder(unpack_bits(packed, self.config.voxel_size).to(dtype))
+
+    def forward(self, batch: ShapeBatch) -> None:
+        """The Pyro guide of `ShapeStory`."""
+        loc, scale = self.posterior(batch.voxels)
+        noise = None if batch.noise is None else batch.noise[None]
+        with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(loc), dim=-1):
+            pyro.sample("shape_latent", NoisyNormal(loc[None], scale[None], noise).to_event(1))
+
+
