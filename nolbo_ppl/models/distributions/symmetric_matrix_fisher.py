@@ -1,0 +1,127 @@
+"""Matrix Fisher distribution of a symmetric object: the mixture over the group about its vertical axis."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import constraints
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.models.distributions.bessel import log_i0e
+from nolbo_ppl.models.distributions.matrix_fisher import (
+    MatrixFisher,
+    log_normalizer_excess,
+    mean_resultant,
+    rotation_constraint,
+)
+from nolbo_ppl.models.distributions.symmetry import group_angles, rotation_about_vertical
+
+
+class SymmetricMatrixFisher(TorchDistribution):
+    """Equal mixture over the turns g of an object about its own vertical axis: `p(R) = mean_g MF(R g; R_mode, kappa)`.
+
+    `R` and `R Rz(2 pi j / n)` look the same and have the same density. Density against the normalised Haar measure.
+
+    Args:
+        R_mode: one of the equivalent modes, a rotation.
+        concentration: kappa >= 0 of each element.
+        order: 1 no symmetry, n n-fold, 0 free about the axis (the mean over the whole circle, in closed form).
+
+    Method section 2 (symmetry).
+    """
+
+    arg_constraints = {
+        "R_mode": rotation_constraint,
+        "concentration": constraints.nonnegative,
+        "order": constraints.nonnegative_integer,
+    }
+    support = rotation_constraint
+    has_rsample = True
+
+    def __init__(
+        self,
+        R_mode: Float[Tensor, "*#batch 3 3"],
+        concentration: Float[Tensor, "*#batch"] | float,
+        order: Int[Tensor, "*#batch"] | int,
+        validate_args: bool | None = None,
+    ) -> None:
+        concentration = torch.as_tensor(concentration, dtype=R_mode.dtype, device=R_mode.device)
+        order = torch.as_tensor(order, device=R_mode.device)
+        if order.dtype.is_floating_point:
+            raise input_error("an order of symmetry that is no integer", got=order.dtype, expected="an int tensor")
+        batch_shape = torch.broadcast_shapes(R_mode.shape[:-2], concentration.shape, order.shape)
+        self.R_mode = R_mode.expand(*batch_shape, 3, 3)
+        self.concentration = concentration.expand(batch_shape)
+        self.order = order.expand(batch_shape)
+        super().__init__(batch_shape, torch.Size((3, 3)), validate_args=validate_args)
+
+    def expand(self, batch_shape, _instance=None) -> SymmetricMatrixFisher:
+        """The same distribution with a larger batch shape."""
+        new = self._get_checked_instance(SymmetricMatrixFisher, _instance)
+        batch_shape = torch.Size(batch_shape)
+        new.R_mode = self.R_mode.expand(*batch_shape, 3, 3)
+        new.concentration = self.concentration.expand(batch_shape)
+        new.order = self.order.expand(batch_shape)
+        super(SymmetricMatrixFisher, new).__init__(batch_shape, self.event_shape, validate_args=False)
+        new._validate_args = self._validate_args
+        return new
+
+    def log_prob(self, value: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
+        """Log density in nats.
+
+        Order n: logsumexp over the group. Order 0: with `M = R_mode' R`, `tr(M Rz(w)) = M_22 + b cos(w - w_0)`, whose
+        exponential integrates to `I0(kappa b)`; for two rotations `b = 1 + M_22`, and `1 - M_22` is half the squared
+        distance of the two vertical axes.
+        """
+        if self._validate_args:
+            self._validate_sample(value)
+        angles, log_weight = group_angles(self.order, self.R_mode.dtype)
+        turned = value[..., None, :, :] @ rotation_about_vertical(angles)
+        misfit = 0.5 * (turned - self.R_mode[..., None, :, :]).square().sum((-2, -1))
+        finite = torch.logsumexp(log_weight - self.concentration[..., None] * misfit, -1)
+        between_axes = (value[..., :, 2] - self.R_mode[..., :, 2]).square().sum(-1)
+        around = (2 - 0.5 * between_axes).clamp_min(0)
+        free = log_i0e(self.concentration * around) - self.concentration * between_axes
+        return torch.where(self.order == 0, free, finite) - log_normalizer_excess(self.concentration)
+
+    def expected_log_prob(self, mean_rotation: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
+        """Lower bound of `E_q[log p(R_mode | R_z)]`, R_mode observed, R_z random with mean `mean_rotation`. Nats.
+
+        The density is symmetric in the rotation and its mode. Order 1: exact, the log density is linear in R_z. Order
+        n: `logsumexp_g E[kappa tr(R_z' R g)] - log n - log c`; log-sum-exp is convex, so by Jensen it is no more than the
+        expectation (the responsibilities of the group elements are fixed instead of following R_z), and the evidence
+        bound stays one. Order 0 in the same way: `log I0(kappa b) + kappa M_22` of the mean M is convex in M.
+        """
+        M = mean_rotation.mT @ self.R_mode
+        along, cosine, sine = M[..., 2, 2], M[..., 0, 0] + M[..., 1, 1], M[..., 0, 1] - M[..., 1, 0]
+        kappa = self.concentration
+        angles, log_weight = group_angles(self.order, self.R_mode.dtype)
+        trace = along[..., None] + cosine[..., None] * torch.cos(angles) + sine[..., None] * torch.sin(angles)
+        finite = torch.logsumexp(log_weight + kappa[..., None] * (trace - 3), -1)
+        around = torch.linalg.vector_norm(torch.stack((cosine, sine), -1), dim=-1)
+        free = log_i0e(kappa * around) + kappa * (along + around - 3)
+        return torch.where(self.order == 0, free, finite) - log_normalizer_excess(kappa)
+
+    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 3 3"]:
+        """Exact sample, reparameterised through mode and concentration; the turn is uniform over the group."""
+        one = MatrixFisher(self.R_mode, self.concentration, validate_args=False).rsample(sample_shape)
+        turn = torch.rand(one.shape[:-2], dtype=one.dtype, device=one.device)
+        count = self.order.clamp_min(1)
+        turn = torch.where(self.order == 0, turn, torch.floor(turn * count) / count)
+        return one @ rotation_about_vertical(2 * math.pi * turn)
+
+    @property
+    def mean(self) -> Float[Tensor, "*batch 3 3"]:
+        """E[R]: `rho R_mode`, of which a symmetry leaves the column of the vertical axis alone."""
+        mean = mean_resultant(self.concentration)[..., None, None] * self.R_mode
+        vertical = torch.tensor([0.0, 0.0, 1.0], dtype=mean.dtype, device=mean.device)
+        return torch.where((self.order == 1)[..., None, None], mean, mean * vertical)
+
+    @property
+    def mode(self) -> Float[Tensor, "*batch 3 3"]:
+        """One of the equivalent rotations of the highest density."""
+        return self.R_mode
