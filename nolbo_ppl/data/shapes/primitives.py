@@ -1,0 +1,328 @@
+"""Solid primitives: each gives a closed triangle mesh with a role per face and an exact inside test on a grid.
+
+The inside tests take the three coordinate vectors of a box-shaped grid, so that most of the work is done on one or
+two axes, and a least half-thickness `thin` in the same unit: a part thinner than that is tested as if it were that
+thick, so that tubes and panels survive a coarse voxel grid.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nolbo_ppl.data.shapes.polygon import Points, grid_inside, half_thickness, signed_area, triangulate
+from nolbo_ppl.errors import input_error
+
+Axis = Float[np.ndarray, " n"]
+Mesh = tuple[np.ndarray, np.ndarray, list[str]]
+"""Vertices float64 [v, 3], faces int [f, 3] counter-clockwise seen from outside, and a role per face."""
+
+PLANE_AXES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}
+"""The two axes (v, w) of the plane across axis u. (u, v, w) is right-handed except for u = 1."""
+
+
+class Primitive(Protocol):
+    """What every primitive offers."""
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The least and the greatest corner of its box."""
+
+    def mesh(self) -> Mesh:
+        """Its closed surface."""
+
+    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
+        """Which points of the grid x by y by z it holds, tested at least `thin` thick to each side."""
+
+
+def _to_world(axis: int, u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+    points = np.empty((len(u), 3))
+    points[:, axis] = u
+    points[:, PLANE_AXES[axis][0]] = v
+    points[:, PLANE_AXES[axis][1]] = w
+    return points
+
+
+def _from_plane(axis: int, grid_uvw: np.ndarray) -> np.ndarray:
+    """Reorder an array indexed [u, v, w] to [x, y, z]."""
+    return grid_uvw if axis == 0 else grid_uvw.transpose(1, 0, 2) if axis == 1 else grid_uvw.transpose(1, 2, 0)
+
+
+def _rings_to_faces(rings: int, segments: int, closed: bool = False) -> np.ndarray:
+    """Faces between consecutive rings of `segments` vertices each; [bands * segments * 2, 3], band by band."""
+    ring, corner = np.meshgrid(np.arange(rings if closed else rings - 1), np.arange(segments), indexing="ij")
+    a = ring * segments + corner
+    b = ring * segments + (corner + 1) % segments
+    above = (ring + 1) % rings * segments
+    c, d = above + (corner + 1) % segments, above + corner
+    return np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Extrusion:
+    """A polygon in the plane across `axis`, extruded between two planes that may slant.
+
+    The planes are u = low . (1, v, w) and u = high . (1, v, w), so that a box, a wedge, a wing with dihedral and a car
+    body narrowing upwards are all exact.
+
+    Attributes:
+        axis: the axis of extrusion u (0, 1, 2); the profile lies in the two others, in the order x, y, z.
+        profile: corners [n, 2], either orientation, not crossing itself.
+        low: coefficients (constant, per v, per w) of the lower plane.
+        high: coefficients of the upper plane.
+        roles: a role for each edge; edge i runs from corner i to corner i + 1.
+        cap_roles: roles of the lower and the upper cap.
+    """
+
+    axis: int
+    profile: Points
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    roles: tuple[str, ...]
+    cap_roles: tuple[str, str]
+    _half: float = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        profile = np.asarray(self.profile, dtype=np.float64)
+        roles = self.roles
+        if len(roles) != len(profile):
+            raise input_error("one role per edge", got=len(roles), expected=len(profile))
+        if signed_area(profile) < 0:
+            profile, roles = profile[::-1].copy(), tuple(roles[:-1][::-1]) + (roles[-1],)
+        object.__setattr__(self, "profile", profile)
+        object.__setattr__(self, "roles", roles)
+        object.__setattr__(self, "_half", half_thickness(profile))
+        if (self._plane(self.low) > self._plane(self.high) + 1e-12).any():
+            raise input_error("planes of an extrusion cross inside its profile", got=(self.low, self.high))
+
+    def _plane(self, plane: tuple[float, float, float]) -> np.ndarray:
+        return plane[0] + self.profile @ np.array(plane[1:])
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The least and the greatest corner of its box."""
+        (v0, w0), (v1, w1) = self.profile.min(0), self.profile.max(0)
+        u = np.array([self._plane(self.low).min(), self._plane(self.high).max()])
+        return _to_world(self.axis, u, np.array([v0, v1]), np.array([w0, w1]))
+
+    def mesh(self) -> Mesh:
+        """Two caps and a quadrilateral per edge."""
+        n = len(self.profile)
+        v, w = self.profile.T
+        vertices = np.concatenate(
+            [_to_world(self.axis, self._plane(plane), v, w) for plane in (self.low, self.high)]
+        )
+        caps = triangulate(self.profile)
+        faces = [(a, c, b) for a, b, c in caps] + [(a + n, b + n, c + n) for a, b, c in caps]
+        names = [self.cap_roles[0]] * len(caps) + [self.cap_roles[1]] * len(caps)
+        for i in range(n):
+            j = (i + 1) % n
+            faces += [(i, j, j + n), (i, j + n, i + n)]
+            names += [self.roles[i]] * 2
+        array = np.array(faces)
+        return vertices, array[:, ::-1] if self.axis == 1 else array, names
+
+    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
+        """A polygon test on the plane and two comparisons in space."""
+        grid = (x, y, z)
+        u = grid[self.axis]
+        v, w = (grid[i] for i in PLANE_AXES[self.axis])
+        mask = grid_inside(self.profile, v, w, margin=max(thin - self._half, 0.0))
+        low, high = (p[0] + p[1] * v[:, None] + p[2] * w[None, :] for p in (self.low, self.high))
+        extra = np.maximum(thin - 0.5 * (high - low), 0.0)
+        inside = (u[:, None, None] >= low - extra) & (u[:, None, None] <= high + extra) & mask
+        return _from_plane(self.axis, inside)
+
+
+@dataclass(frozen=True)
+class Loft:
+    """Cross-sections of one form, placed and sized at stations along an axis and joined by straight lines.
+
+    Attributes:
+        axis: the axis the stations lie on.
+        stations: increasing coordinates [k] along the axis.
+        centre: centres [k, 2] of the sections in the plane across the axis (order x, y, z).
+        half: half sizes [k, 2], positive.
+        exponent: sections are superellipses |a|^p + |b|^p <= 1: 2 an ellipse, 8 nearly a box; unused with `section`.
+        section: a convex polygon in [-1, 1]^2 instead of the superellipse.
+        segments: corners of the mesh's superellipse.
+        roles: a role for each band between stations.
+        cap_roles: roles of the first and the last cap.
+    """
+
+    axis: int
+    stations: Float[np.ndarray, " k"]
+    centre: Float[np.ndarray, "k 2"]
+    half: Float[np.ndarray, "k 2"]
+    exponent: float
+    section: Points | None
+    segments: int
+    roles: tuple[str, ...]
+    cap_roles: tuple[str, str]
+
+    def _ring(self) -> Points:
+        if self.section is not None:
+            return self.section if signed_area(self.section) > 0 else self.section[::-1]
+        # Half a step of offset keeps edges flat against the axes, as sides of boxy sections should be.
+        angle = (np.arange(self.segments) + 0.5) * (2 * math.pi / self.segments)
+        circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+        return np.sign(circle) * np.abs(circle) ** (2.0 / self.exponent)
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The least and the greatest corner of its box."""
+        low, high = (self.centre - self.half).min(0), (self.centre + self.half).max(0)
+        u = self.stations[[0, -1]]
+        return _to_world(self.axis, u, np.array([low[0], high[0]]), np.array([low[1], high[1]]))
+
+    def mesh(self) -> Mesh:
+        """Rings joined by quadrilaterals, and two caps."""
+        ring = self._ring()
+        k, n = len(self.stations), len(ring)
+        plane = (self.centre[:, None] + self.half[:, None] * ring).reshape(-1, 2)
+        vertices = _to_world(self.axis, np.repeat(self.stations, n), plane[:, 0], plane[:, 1])
+        fan = np.array([(0, i, i + 1) for i in range(1, n - 1)])
+        faces = np.concatenate([_rings_to_faces(k, n), fan[:, ::-1], fan + (k - 1) * n])
+        names = [role for role in self.roles for _ in range(2 * n)]
+        names += [self.cap_roles[0]] * (n - 2) + [self.cap_roles[1]] * (n - 2)
+        return vertices, faces[:, ::-1] if self.axis == 1 else faces, names
+
+    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
+        """Sections interpolated along the axis, then a test that is a sum over the two other axes."""
+        grid = (x, y, z)
+        u = grid[self.axis]
+        v, w = (grid[i] for i in PLANE_AXES[self.axis])
+        extra = max(thin - 0.5 * float(self.stations[-1] - self.stations[0]), 0.0)
+        within = (u >= self.stations[0] - extra) & (u <= self.stations[-1] + extra)
+        c0, c1 = (np.interp(u, self.stations, self.centre[:, i]) for i in (0, 1))
+        h0, h1 = (np.maximum(np.interp(u, self.stations, self.half[:, i]), thin) for i in (0, 1))
+        a, b = (v - c0[:, None]) / h0[:, None], (w - c1[:, None]) / h1[:, None]  # [u, v], [u, w]
+        if self.section is None:
+            a, b = np.abs(a) ** self.exponent, np.abs(b) ** self.exponent
+            inside = a[:, :, None] <= (1.0 - b)[:, None, :]
+        else:
+            ring = self._ring()
+            edge = np.roll(ring, -1, axis=0) - ring
+            inside = np.ones((len(u), len(v), len(w)), dtype=bool)
+            for (p, q), (dp, dq) in zip(ring, edge):
+                inside &= ((a - p) * dq)[:, :, None] <= ((b - q) * dp)[:, None, :]
+        return _from_plane(self.axis, inside & within[:, None, None])
+
+
+@dataclass(frozen=True)
+class Tube:
+    """A round tube along a path, with a radius at each point (straight in between) and flat ends.
+
+    Attributes:
+        path: points [k, 3].
+        radius: radii [k].
+        role: its role.
+        segments: corners of a ring of the mesh.
+    """
+
+    path: Float[np.ndarray, "k 3"]
+    radius: Float[np.ndarray, " k"]
+    role: str
+    segments: int = 6
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The least and the greatest corner of its box (flat ends are given their radius too: never too small)."""
+        return np.stack([(self.path - self.radius[:, None]).min(0), (self.path + self.radius[:, None]).max(0)])
+
+    def mesh(self) -> Mesh:
+        """Rings carried along the path without twist, and two caps."""
+        step = np.diff(self.path, axis=0)
+        step /= np.sqrt((step**2).sum(-1, keepdims=True))
+        tangent = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
+        length = np.sqrt((tangent**2).sum(-1, keepdims=True))
+        tangent /= length
+        # A mitred joint is wider than the tube by 1 / cos(half the bend): |t_1 + t_2| = 2 cos(half the bend).
+        mitre = np.where(np.arange(len(tangent)) % (len(tangent) - 1) == 0, 1.0, 2.0 / np.maximum(length[:, 0], 1.0))
+        side = np.eye(3)[np.argmin(np.abs(tangent[0]))]
+        angle = np.arange(self.segments) * (2 * math.pi / self.segments)
+        rings = []
+        for point, t, r in zip(self.path, tangent, self.radius * mitre):
+            side = side - (side @ t) * t
+            side /= math.sqrt(side @ side)
+            up = np.array(
+                [t[1] * side[2] - t[2] * side[1], t[2] * side[0] - t[0] * side[2], t[0] * side[1] - t[1] * side[0]]
+            )
+            rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up))
+        k, n = len(self.path), self.segments
+        fan = np.array([(0, i, i + 1) for i in range(1, n - 1)])
+        faces = np.concatenate([_rings_to_faces(k, n), fan[:, ::-1], fan + (k - 1) * n])
+        return np.concatenate(rings), faces, [self.role] * len(faces)
+
+    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
+        """Distance to each straight piece; joints are round, ends flat."""
+        result = np.zeros((len(x), len(y), len(z)), dtype=bool)
+        last = len(self.path) - 2
+        for i in range(last + 1):
+            a, b = self.path[i].tolist(), self.path[i + 1].tolist()
+            r0, r1 = max(float(self.radius[i]), thin), max(float(self.radius[i + 1]), thin)
+            pad = max(r0, r1)
+            window = tuple(
+                slice(*np.searchsorted(axis, (min(p, q) - pad, max(p, q) + pad))) for axis, p, q in zip((x, y, z), a, b)
+            )
+            dx, dy, dz = x[window[0]] - a[0], y[window[1]] - a[1], z[window[2]] - a[2]
+            ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+            square = ex * ex + ey * ey + ez * ez
+            along = ((dx * (ex / square))[:, None] + dy * (ey / square))[:, :, None] + dz * (ez / square)
+            near = np.clip(along, 0.0, 1.0)
+            # |d - near e|^2 = |d|^2 - (2 along - near) near |e|^2
+            distance = ((dx * dx)[:, None] + dy * dy)[:, :, None] + dz * dz - (2 * along - near) * near * square
+            hit = distance <= (r0 + near * (r1 - r0)) ** 2
+            overhang = max(thin / math.sqrt(square) - 0.5, 0.0) if last == 0 else 0.0
+            if i == 0:
+                hit &= along >= -overhang
+            if i == last:
+                hit &= along <= 1.0 + overhang
+            result[window] |= hit
+        return result
+
+
+@dataclass(frozen=True)
+class Torus:
+    """A ring around an axis: tyres.
+
+    Attributes:
+        axis: the axis it turns about.
+        centre: its centre [3].
+        ring: radius of the circle in its middle.
+        tube: radius across it.
+        role: its role.
+        segments: corners around the axis and around the tube.
+    """
+
+    axis: int
+    centre: tuple[float, float, float]
+    ring: float
+    tube: float
+    role: str
+    segments: tuple[int, int] = (16, 5)
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """The least and the greatest corner of its box."""
+        half = np.full(3, self.ring + self.tube)
+        half[self.axis] = self.tube
+        return np.array([self.centre - half, self.centre + half])
+
+    def mesh(self) -> Mesh:
+        """Rings of the tube around the axis."""
+        n, m = self.segments
+        around, across = np.meshgrid(np.arange(n) * 2 * math.pi / n, np.arange(m) * 2 * math.pi / m, indexing="ij")
+        radius = (self.ring + self.tube * np.cos(across)).ravel()
+        v, w = radius * np.cos(around.ravel()), radius * np.sin(around.ravel())
+        vertices = _to_world(self.axis, self.tube * np.sin(across.ravel()), v, w) + np.array(self.centre)
+        faces = _rings_to_faces(n, m, closed=True)
+        return vertices, faces if self.axis == 1 else faces[:, ::-1], [self.role] * len(faces)
+
+    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
+        """(distance from the axis - ring)^2 + height^2 <= tube^2, the first part on the plane alone."""
+        grid = [axis - c for axis, c in zip((x, y, z), self.centre)]
+        u = grid[self.axis]
+        v, w = (grid[i] for i in PLANE_AXES[self.axis])
+        plane = (np.sqrt(v[:, None] ** 2 + w[None, :] ** 2) - self.ring) ** 2
+        tube = max(self.tube, thin)
+        return _from_plane(self.axis, plane <= (tube * tube - u * u)[:, None, None])
