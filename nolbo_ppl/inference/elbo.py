@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from pyro import poutine
 from pyro.distributions import TorchDistribution
+from pyro.poutine.messenger import Messenger
 from torch import Tensor
 from torch.distributions import kl_divergence
 
@@ -131,7 +132,7 @@ class SceneElbo:
         """
         wanted = set(BOUND_TERMS) if names is None else names
         guide_trace = poutine.trace(poutine.enum(guide, first_available_dim=-3)).get_trace(*args)
-        model_trace = poutine.trace(poutine.replay(model, trace=guide_trace)).get_trace(*args, **kwargs)
+        model_trace = poutine.trace(_Replay(guide_trace)(model)).get_trace(*args, **kwargs)
         self._check_sites(model_trace, guide_trace)
         enumerated = _enumerated(guide_trace)
         terms: dict[str, Tensor] = {}
@@ -165,6 +166,20 @@ class SceneElbo:
                 f"story and guide disagree about latent sites: only in the story {sorted(latent - guided)}, "
                 f"only in the guide {sorted(guided - latent)}"
             )
+
+
+class _Replay(Messenger):
+    """Run the story at the guide's values. Pyro's own replay overwrites the story's `infer` (the truths) by the guide's."""
+
+    def __init__(self, guide_trace: poutine.Trace) -> None:
+        super().__init__()
+        self.guide_trace = guide_trace
+
+    def _pyro_sample(self, msg: Any) -> None:
+        guide_site = self.guide_trace.nodes.get(msg["name"])
+        if guide_site is not None and guide_site["type"] == "sample" and not msg["is_observed"]:
+            msg["done"] = True
+            msg["value"] = guide_site["value"]
 
 
 def _enumerated(guide_trace: poutine.Trace) -> dict[str, tuple[int, Tensor]]:

@@ -10,20 +10,19 @@ import pyro.distributions as dist
 import torch
 from jaxtyping import Float, Int
 from pyro import poutine
-from pyro.nn import PyroModule
-from torch import Tensor
+from torch import Tensor, nn
 
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.models.backbones import check_image, make_encoder, normalise_image
 from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.distributions import (
     NoisyNormal,
-    Objectness,
     ViewpointMixture,
     ViewpointNormal,
     ViewpointSinCos,
     kl_to_each_component,
 )
+from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.head import RegionHead, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
@@ -65,7 +64,7 @@ def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> 
     return ViewpointNormal(loc, scale) if config.orientation == "angle" else ViewpointSinCos(loc, scale)
 
 
-class Guide(PyroModule):
+class Guide(nn.Module):
     """Encoder and head, and the Pyro guide they amortise."""
 
     def __init__(self, config: ModelConfig, prior: LabelPrior) -> None:
@@ -74,6 +73,8 @@ class Guide(PyroModule):
         self.encoder = make_encoder(config)
         self.head = RegionHead(self.encoder.channels, config)
         self._prior: Callable[[], LabelPrior] = lambda: prior  # owned by the story, shared here
+        self.half_precision = False
+        """Run encoder and head in bfloat16, everything after them in the weights' own precision."""
 
     def encode(self, image: Tensor) -> Encoding:
         """Run the encoder on whole images, uint8 or float in 0..255, sides multiples of 32.
@@ -86,21 +87,27 @@ class Guide(PyroModule):
         x = normalise_image(image, dtype)
         if dtype == torch.float32:  # faster convolutions on CPUs
             x = x.contiguous(memory_format=torch.channels_last)
-        maps = self.encoder(x)
-        features = maps.flatten(2).transpose(1, 2)
-        logit = self.head.objectness(features).flatten(1)
+        with self._autocast():
+            maps = self.encoder(x)
+            features = maps.flatten(2).transpose(1, 2)
+            logit = self.head.objectness(features).flatten(1)
         return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3])
 
-    def region_parameters(
-        self, encoding: Encoding, cell: Int[Tensor, "b m"], predictor: Int[Tensor, "b m"]
-    ) -> RegionParameters:
-        """Posterior parameters of given regions."""
-        return self.head.parameters_of(_select(self._raw(encoding, cell), predictor), self._prior().label_mean())
+    def parameters_at(self, features: Float[Tensor, "n c"], predictor: Int[Tensor, " n"]) -> RegionParameters:
+        """Posterior parameters of given regions, from the features of their cells."""
+        with self._autocast():
+            raw = self.head(features)
+        raw = raw.to(self.head.objectness.weight.dtype)
+        return self.head.parameters_of(raw[torch.arange(len(raw)), predictor], self._prior().label_mean())
 
     def _raw(self, encoding: Encoding, cell: Int[Tensor, "b m"]) -> Float[Tensor, "b m predictors outputs"]:
         index = cell[..., None].expand(-1, -1, encoding.features.shape[-1])
-        dtype = self.head.objectness.weight.dtype
-        return self.head(torch.gather(encoding.features, 1, index)).to(dtype)
+        with self._autocast():
+            raw = self.head(torch.gather(encoding.features, 1, index))
+        return raw.to(self.head.objectness.weight.dtype)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision)
 
     def observe(self, batch: SceneBatch) -> ObservedScene:
         """Encode a batch and find the responsible region of each object."""
@@ -210,7 +217,7 @@ def assign_predictors(
     that finds none free is left out (second result false).
     """
     b, m, p = iou.shape
-    order = torch.where(present, iou.max(-1).values, iou.new_tensor(-1.0)).argsort(1, descending=True, stable=True)
+    order = torch.where(present, iou.max(-1).values, iou.new_tensor(-1.0)).argsort(dim=1, descending=True, stable=True)
     taken = torch.zeros(b, m, p, dtype=torch.bool)  # predictors already taken in the cell of each object
     predictor = torch.zeros(b, m, dtype=torch.long)
     assigned = torch.zeros(b, m, dtype=torch.bool)

@@ -41,7 +41,7 @@ class RegionParameters:
     range_scale: Float[Tensor, "*n 4"]
     """Scale of the range latent."""
 
-    def map(self, function) -> RegionParameters:  # noqa: ANN001
+    def map(self, function) -> RegionParameters:
         """Apply a function to every tensor."""
         return RegionParameters(**{f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self)})
 

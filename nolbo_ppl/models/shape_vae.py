@@ -8,8 +8,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float, Int, UInt8
-from pyro.nn import PyroModule
-from torch import Tensor
+from torch import Tensor, nn
 
 from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.distributions import NoisyNormal
@@ -32,7 +31,7 @@ class ShapeBatch:
     """Standard normal noise of the latent's sample."""
 
 
-class ShapeStory(torch.nn.Module):
+class ShapeStory(nn.Module):
     """The part of the story that makes voxels from labels; shares prior and decoder with the story of scenes."""
 
     def __init__(self, story: Story) -> None:
@@ -52,7 +51,7 @@ class ShapeStory(torch.nn.Module):
         voxel_site(logits, unpack_bits(batch.voxels, size).to(logits.dtype))
 
 
-class ShapeGuide(PyroModule):
+class ShapeGuide(nn.Module):
     """q(z | true shape): the teacher of the image guide."""
 
     def __init__(self, config: ModelConfig) -> None:

@@ -21,12 +21,12 @@ import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
 from pyro import poutine
-from pyro.nn import PyroModule
-from torch import Tensor
+from torch import Tensor, nn
 
 from nolbo_ppl.geometry.rotation import viewpoint_to_matrix
 from nolbo_ppl.models.config import ModelConfig
-from nolbo_ppl.models.distributions import Objectness, SymmetricMatrixFisher, ViewpointNormal, ViewpointSinCos
+from nolbo_ppl.models.distributions import SymmetricMatrixFisher, ViewpointNormal, ViewpointSinCos
+from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene import SceneBatch, unpack_bits
@@ -47,8 +47,11 @@ def expected_normal_log_prob(
     return -0.5 * (deviation + math.log(2 * math.pi * scale**2)).sum(-1)
 
 
-class Story(PyroModule):
-    """The generative model, owner of the prior networks and of the decoder."""
+class Story(nn.Module):
+    """The generative model, owner of the prior networks and of the decoder.
+
+    A plain torch module whose forward makes Pyro statements: its parameters never enter Pyro's global store.
+    """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -90,9 +93,10 @@ class Story(PyroModule):
             kappa = batch.viewpoint.new_tensor(config.rotation_concentration)
             R = viewpoint_to_matrix(batch.viewpoint)
             likelihood = SymmetricMatrixFisher(viewpoint_to_matrix(angles), kappa, batch.symmetry)
+            reverse = SymmetricMatrixFisher(R, kappa, batch.symmetry)  # the density is symmetric in rotation and mode
 
             def expected(q: dist.TorchDistribution) -> Tensor:
-                return likelihood.expected_log_prob(R, q.mean_rotation())
+                return reverse.expected_log_prob(q.mean_rotation())
 
             pyro.sample("rotation", likelihood, obs=R, infer={"expected_log_prob": ("orientation_latent", expected)})
 

@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+from nolbo_ppl.models.distributions.bernoulli import (
+    Objectness,
+    bernoulli_entropy,
+    log_kappa_objectness,
+    objectness_cross_entropy,
+    objectness_kl_exclusive,
+    objectness_kl_inclusive,
+    objectness_prior,
+)
 from nolbo_ppl.models.distributions.gaussian_mixture import (
     component_log_prob,
     enumerated_kl,
@@ -17,14 +26,6 @@ from nolbo_ppl.models.distributions.matrix_fisher import (
     mean_resultant,
     rotation_constraint,
     scale_to_concentration,
-)
-from nolbo_ppl.models.distributions.objectness import (
-    bernoulli_entropy,
-    log_kappa_objectness,
-    objectness_cross_entropy,
-    objectness_kl_exclusive,
-    objectness_kl_inclusive,
-    objectness_prior_logit,
 )
 from nolbo_ppl.models.distributions.reparam import NoisyNormal
 from nolbo_ppl.models.distributions.sincos_normal import SinCosNormal, sincos_to_angle
@@ -45,6 +46,7 @@ __all__ = [
     "MAX_CONCENTRATION",
     "MatrixFisher",
     "NoisyNormal",
+    "Objectness",
     "SinCosNormal",
     "SymmetricMatrixFisher",
     "TrigonometricMoments",
@@ -70,7 +72,7 @@ __all__ = [
     "objectness_cross_entropy",
     "objectness_kl_exclusive",
     "objectness_kl_inclusive",
-    "objectness_prior_logit",
+    "objectness_prior",
     "rotation_constraint",
     "scale_to_concentration",
     "sincos_to_angle",

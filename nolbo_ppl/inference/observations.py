@@ -1,0 +1,149 @@
+"""What the guide observed in one image: the posterior of every detected object, as plain arrays with answers on top."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.geometry.voxels import voxels_to_mesh
+
+
+@dataclass(frozen=True)
+class ViewpointModes:
+    """Azimuth posterior of n objects: von Mises mixtures of K modes."""
+
+    weights: Float[np.ndarray, "n modes"]
+    """Weight of each mode."""
+    azimuth: Float[np.ndarray, "n modes"]
+    """Mean direction of each mode, rad."""
+    concentration: Float[np.ndarray, "n modes"]
+    """Concentration of each mode; the scale in rad is about 1 / sqrt(concentration)."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Posteriors of the n objects of one image, best objectness first; metres, radians, the camera's frame."""
+
+    categories: tuple[str, ...]
+    """Names of the category labels."""
+    objectness: Float[np.ndarray, " n"]
+    """q(o = 1 | I)."""
+    box: Float[np.ndarray, "n 4"]
+    """Mean image box [x0, y0, x1, y1], px of the image that was given."""
+    box_scale: Float[np.ndarray, "n 4"]
+    """Scales of (centre x, centre y, log width, log height): px, px, and nats."""
+    class_log_posterior: Float[np.ndarray, "n labels"]
+    """log q(l | I), normalised."""
+    class_log_likelihood: Float[np.ndarray, "n labels"]
+    """log N(mu_q; mu_psi(l), I) of each category, whose argmax is the maximum-likelihood category (method section 4)."""
+    instance_log_posterior: Float[np.ndarray, "n instances"] | None
+    """Normalised log posterior of known instances ("novel" last); None for models without instance labels."""
+    latent: Float[np.ndarray, "n d"]
+    """Mean of the shape latent."""
+    latent_scale: Float[np.ndarray, "n d"]
+    """Scale of the shape latent."""
+    position: Float[np.ndarray, "n 3"]
+    """Centre of the object's box in the camera frame, m."""
+    position_covariance: Float[np.ndarray, "n 3 3"]
+    """Its covariance, m^2."""
+    viewpoint_modes: ViewpointModes
+    """Azimuth posterior, allocentric."""
+    elevation_inplane: Float[np.ndarray, "n 2"]
+    """Mean elevation and in-plane rotation, allocentric, rad."""
+    elevation_inplane_scale: Float[np.ndarray, "n 2"]
+    """Their scales, rad."""
+    viewpoint: Float[np.ndarray, "n 3"]
+    """(azimuth, elevation, in-plane) at the highest posterior density, allocentric, rad."""
+    R_camera_object: Float[np.ndarray, "n 3 3"]
+    """Egocentric rotation at that viewpoint."""
+    rotation_scale: Float[np.ndarray, " n"]
+    """Scale of the rotation about its mode, rad: root mean square over the three angles' scales of the best mode."""
+    diagonal: Float[np.ndarray, " n"]
+    """Diagonal of the object's box, m."""
+    diagonal_log_scale: Float[np.ndarray, " n"]
+    """Scale of the log diagonal."""
+    size: Float[np.ndarray, "n 3"]
+    """Extents of the object along its own x, y, z axes, m: the diagonal times the decoded shape's extents."""
+    voxel_mean: Float[np.ndarray, "n v v v"] | None
+    """Posterior mean occupancy of the canonical grid; None when shapes were not decoded."""
+    voxel_variance: Float[np.ndarray, "n v v v"] | None
+    """Posterior variance of each voxel's occupancy probability over the shape latent."""
+
+    def __len__(self) -> int:
+        return len(self.objectness)
+
+    def __getitem__(self, index: Int[np.ndarray, " k"] | slice | list[int]) -> Observations:
+        """Some of the objects."""
+        fields: dict[str, Any] = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value = value[index]
+            elif isinstance(value, ViewpointModes):
+                value = ViewpointModes(*(getattr(value, f.name)[index] for f in dataclasses.fields(value)))
+            fields[field.name] = value
+        return Observations(**fields)
+
+    @property
+    def category(self) -> list[str]:
+        """Maximum-likelihood category of each object, `argmax_l N(mu_q; mu_psi(l), I)`."""
+        return [self.categories[i] for i in self.class_log_likelihood.argmax(-1)]
+
+    @property
+    def class_posterior(self) -> Float[np.ndarray, "n labels"]:
+        """q(l | I)."""
+        return np.exp(self.class_log_posterior)
+
+    def mesh(self, index: int, metric: bool = True) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+        """Mesh of an object's mean shape by marching cubes, in its own frame; in metres, or in units of the diagonal.
+
+        Raises:
+            ValueError: shapes were not decoded.
+        """
+        if self.voxel_mean is None:
+            raise ValueError("shapes were not decoded: observe with decode=True")
+        vertices, faces = voxels_to_mesh(self.voxel_mean[index])
+        return vertices * (self.diagonal[index] if metric else 1.0), faces
+
+    def rows(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
+        """One JSON-able dictionary an object, the lines of `observations.jsonl` (the format SLAM reads)."""
+        import torch
+
+        from nolbo_ppl.geometry.rotation import matrix_to_quaternion  # torch is only needed here
+
+        quaternion = matrix_to_quaternion(torch.from_numpy(np.array(self.R_camera_object, dtype=np.float64))).numpy()
+        for i, category in enumerate(self.category):
+            yield {
+                "frame": frame,
+                "image": image,
+                "id": f"{frame:06d}-{i:03d}",
+                "box": _rounded(self.box[i], 2),
+                "objectness": round(float(self.objectness[i]), 6),
+                "category": category,
+                "class_posterior": dict(zip(self.categories, _rounded(self.class_posterior[i], 6))),
+                "position": _rounded(self.position[i], 5),
+                "position_cov": [_rounded(row, 9) for row in self.position_covariance[i]],
+                "rotation": _rounded(quaternion[i], 8),
+                "rotation_std": round(float(self.rotation_scale[i]), 5),
+                "viewpoint": _rounded(self.viewpoint[i], 5),
+                "azimuth_modes": [
+                    {"weight": round(float(w), 5), "azimuth": round(float(a), 5), "concentration": round(float(k), 3)}
+                    for w, a, k in zip(
+                        self.viewpoint_modes.weights[i],
+                        self.viewpoint_modes.azimuth[i],
+                        self.viewpoint_modes.concentration[i],
+                    )
+                ],
+                "latent": _rounded(self.latent[i], 5),
+                "latent_std": _rounded(self.latent_scale[i], 5),
+                "size": _rounded(self.size[i], 4),
+            }
+
+
+def _rounded(values: Float[np.ndarray, " n"], digits: int) -> list[float]:
+    return [round(float(v), digits) for v in values]

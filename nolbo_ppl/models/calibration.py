@@ -1,0 +1,71 @@
+"""One calibration factor a head, fitted on held-out scenes: what turns the guide's scales into honest ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.models.head import RegionParameters
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Factors on the guide's posterior; the default changes nothing."""
+
+    objectness_slope: float = 1.0
+    """Factor of the objectness log odds."""
+    objectness_shift: float = 0.0
+    """Added to the objectness log odds after the factor, nats."""
+    label_slope: float = 1.0
+    """Factor of the category's log probabilities (an inverse temperature)."""
+    azimuth_concentration: float = 1.0
+    """Factor of the von Mises concentrations of the azimuth."""
+    angle_scale: float = 1.0
+    """Factor of the scales of elevation and in-plane rotation."""
+    shape_scale: float = 1.0
+    """Factor of the scale of the shape latent."""
+    box_scale: float = 1.0
+    """Factor of the scale of the box latent."""
+    range_scale: float = 1.0
+    """Factor of the scale of the range latent."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (isinstance(value, (int, float)) and abs(value) < 1e6) or (
+                field.name != "objectness_shift" and value <= 0
+            ):
+                raise input_error(f"calibration factor {field.name}", got=value, expected="a positive finite number")
+
+    def objectness(self, logit: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+        """Calibrated log odds of q(o | I)."""
+        return self.objectness_slope * logit + self.objectness_shift
+
+    def apply(self, q: RegionParameters) -> RegionParameters:
+        """Calibrated posterior parameters."""
+        return dataclasses.replace(
+            q,
+            label_logits=q.label_logits * self.label_slope,
+            azimuth_natural=q.azimuth_natural * self.azimuth_concentration,
+            angle_scale=q.angle_scale * self.angle_scale,
+            shape_scale=q.shape_scale * self.shape_scale,
+            box_scale=q.box_scale * self.box_scale,
+            range_scale=q.range_scale * self.range_scale,
+        )
+
+    def to_json(self) -> dict[str, float]:
+        """As a dictionary that JSON can hold."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Calibration:
+        """From `to_json`'s dictionary."""
+        unknown = sorted(set(values) - {field.name for field in dataclasses.fields(cls)})
+        if unknown:
+            raise input_error("unknown calibration factors", got=unknown)
+        return cls(**values)
