@@ -1,4 +1,4 @@
-"""Distributions of the generative story and the guide, as `pyro.distributions.TorchDistribution`s with registered KLs."""
+"""Distributions of the generative story and the guide: Pyro `TorchDistribution`s with registered KLs."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ from nolbo_ppl.models.distributions.matrix_fisher import (
 from nolbo_ppl.models.distributions.reparam import NoisyNormal
 from nolbo_ppl.models.distributions.sincos_normal import SinCosNormal, sincos_to_angle
 from nolbo_ppl.models.distributions.symmetric_matrix_fisher import SymmetricMatrixFisher
-from nolbo_ppl.models.distributions.viewpoint import ViewpointMixture, ViewpointNormal, ViewpointSinCos
+from nolbo_ppl.models.distributions.viewpoint import ViewpointMixture, ViewpointNormal
 from nolbo_ppl.models.distributions.viewpoint_kl import kl_sincos_to_sincos
+from nolbo_ppl.models.distributions.viewpoint_sincos import ViewpointSinCos
 from nolbo_ppl.models.distributions.von_mises import MAX_CONCENTRATION, VonMisesMixture
 from nolbo_ppl.models.distributions.von_mises_kl import kl_mixture_to_wrapped, kl_wrapped_to_mixture
 from nolbo_ppl.models.distributions.wrapped_normal import (

@@ -1,4 +1,4 @@
-"""Objectness: a Bernoulli distribution by its log odds, and the KLs between q(o | I) and p(o | label) in both directions.
+"""Objectness: a Bernoulli by its log odds, and the KLs between q(o | I) and p(o | label) in both directions.
 
 `p(o = 1 | object) = 1 - eps`, `p(o = 1 | background) = eps` (NOLBO appendix I). Stable for log odds of 1e3 and beyond:
 nothing but `logsigmoid` and `softplus` is used.
@@ -7,6 +7,7 @@ nothing but `logsigmoid` and `softplus` is used.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,10 +23,11 @@ from nolbo_ppl.errors import input_error
 class Objectness(Bernoulli):
     """`Bernoulli(logits=...)` with a KL made of log sigmoids only.
 
-    Torch's own is infinite once a probability underflows, at log odds of -104 in single precision, which a network reaches.
+    Torch's own is infinite once a probability underflows, at log odds of -104 in single precision, which a network
+    reaches.
     """
 
-    def expand(self, batch_shape, _instance=None) -> Objectness:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> Objectness:
         """The same distribution with a larger batch shape."""
         return super().expand(batch_shape, _instance=self._get_checked_instance(Objectness, _instance))
 
@@ -66,7 +68,7 @@ def objectness_kl_exclusive(
 def objectness_kl_inclusive(
     logit: Float[Tensor, "*batch"], is_object: Bool[Tensor, "*batch"], eps: float
 ) -> Float[Tensor, "*batch"]:
-    """`KL(p(o | label) || q(o))` in nats, the training default: `objectness_cross_entropy` minus the prior's entropy."""
+    """`KL(p(o | label) || q(o))` in nats, the training default: the cross-entropy below minus the prior's entropy."""
     return kl_divergence(objectness_prior(is_object, eps, logit.dtype), Objectness(logits=logit))
 
 

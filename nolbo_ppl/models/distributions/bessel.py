@@ -1,4 +1,4 @@
-"""Modified Bessel functions of order 0 and 1 in the forms directional statistics needs, stable from 0 to 1e5 and beyond.
+"""Modified Bessel functions of order 0 and 1 in the forms directional statistics needs, stable from 0 to 1e5.
 
 Above `_LARGE` the ratio `I1(x) / I0(x) = sum a_n x^-n` is used; its coefficients follow from the Riccati equation
 `A' = 1 - A^2 - A / x` of the ratio (Mardia & Jupp, Directional Statistics, appendix 1). Every function is built from

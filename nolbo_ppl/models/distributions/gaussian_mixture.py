@@ -14,7 +14,7 @@ def component_log_prob(
 ) -> Float[Tensor, "*batch C"]:
     """`log N(value; mu_c, I)` in nats for every component, NOLBO appendix I.
 
-    The squared distance by one matrix product about the mean of the components, whose error is 1e-7 of the squared spread.
+    The squared distance is one matrix product about the mean of the components; its error is 1e-7 of their spread squared.
     """
     centre = component_loc.detach().mean(0)
     value, component_loc = value - centre, component_loc - centre
@@ -41,8 +41,9 @@ def kl_to_each_component(
 def enumerated_kl(kl: Float[Tensor, "*batch C"], log_weights: Float[Tensor, "*#batch C"]) -> Float[Tensor, "*batch"]:
     """`-log sum_c p(c) exp(-KL_c)` in nats: the KL of latent and label together when the label is unobserved.
 
-    It is `min over q(c) of KL(q(c) || p(c)) + E_q(c)[KL_c]`, reached at `q(c) = p(c) exp(-KL_c) / Z` (`label_posterior`),
-    and bounds the KL of q to the mixture from above (Hershey & Olsen 2007), so the evidence bound stays a bound.
+    It is `min over q(c) of KL(q(c) || p(c)) + E_q(c)[KL_c]`, reached at `q(c) = p(c) exp(-KL_c) / Z`, the
+    `label_posterior`, and bounds the KL of q to the mixture from above (Hershey & Olsen 2007): the evidence bound stays
+    one.
     """
     return -torch.logsumexp(log_weights - kl, -1)
 

@@ -7,6 +7,8 @@ invariant volume in which a small rotation vector counts as d^3 v, add `-LOG_HAA
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -39,7 +41,7 @@ rotation_constraint = _Rotation()
 
 
 def log_normalizer_excess(concentration: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """`log c(kappa) - 3 kappa`, so that `log p(R) = -kappa |R - R_mode|_F^2 / 2 - excess`; for kappa in [0, 1e5] and on.
+    """`log c(kappa) - 3 kappa`, so that `log p(R) = -kappa |R - R_mode|_F^2 / 2 - excess`, for any kappa >= 0.
 
     `c(kappa) = (1 / pi) int_0^pi exp(kappa (1 + 2 cos w)) (1 - cos w) dw = exp(kappa) (I0(2 kappa) - I1(2 kappa))`,
     since the angle of a uniform rotation has density (1 - cos w) / pi. Mardia & Jupp, section 13.2.3.
@@ -63,7 +65,7 @@ def mean_misfit(concentration: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch
 
 
 def mean_resultant(concentration: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """`rho(kappa)` of `E[R] = rho R_mode`: `(log c)'(kappa) / 3 = (A / (kappa (1 - A)) - 1) / 3`, `A = I1 / I0 (2 kappa)`."""
+    """`rho` of `E[R] = rho R_mode`: a third of `(log c)'(kappa) = A / (kappa (1 - A)) - 1`, A = I1 / I0 (2 kappa)."""
     return 1 - mean_misfit(concentration) / 3
 
 
@@ -90,7 +92,7 @@ class MatrixFisher(TorchDistribution):
     NOLBO's p(R^f | R^z), there without its normaliser; method section 2. Mardia & Jupp, section 13.2.3.
     """
 
-    arg_constraints = {"R_mode": rotation_constraint, "concentration": constraints.nonnegative}
+    arg_constraints: ClassVar = {"R_mode": rotation_constraint, "concentration": constraints.nonnegative}
     support = rotation_constraint
     has_rsample = True
 
@@ -106,7 +108,7 @@ class MatrixFisher(TorchDistribution):
         self.concentration = concentration.expand(batch_shape)
         super().__init__(batch_shape, torch.Size((3, 3)), validate_args=validate_args)
 
-    def expand(self, batch_shape, _instance=None) -> MatrixFisher:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> MatrixFisher:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(MatrixFisher, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -116,14 +118,14 @@ class MatrixFisher(TorchDistribution):
         new._validate_args = self._validate_args
         return new
 
-    def log_prob(self, value: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "... 3 3"]) -> Float[Tensor, "*shape"]:
         """Log density in nats; the trace by the Frobenius distance, which cancels nothing near the mode."""
         if self._validate_args:
             self._validate_sample(value)
         misfit = 0.5 * (value - self.R_mode).square().sum((-2, -1))
         return -self.concentration * misfit - log_normalizer_excess(self.concentration)
 
-    def expected_log_prob(self, mean_rotation: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
+    def expected_log_prob(self, mean_rotation: Float[Tensor, "... 3 3"]) -> Float[Tensor, "*shape"]:
         """`E_q[log p(R_mode | R_z)]` for an observed rotation R_mode and a random mode R_z with mean `mean_rotation`.
 
         The density is symmetric in the rotation and its mode and its log linear in the mode, so the mean is all the
@@ -132,7 +134,7 @@ class MatrixFisher(TorchDistribution):
         misfit = 3 - (mean_rotation * self.R_mode).sum((-2, -1))
         return -self.concentration * misfit - log_normalizer_excess(self.concentration)
 
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 3 3"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3 3"]:
         """Exact sample, reparameterised through the mode and, by implicit differentiation, the concentration."""
         shape = self._extended_shape(sample_shape)[:-2]
         concentration = self.concentration.expand(shape)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from pyro.distributions import Normal
@@ -14,8 +16,8 @@ from nolbo_ppl.errors import input_error
 class NoisyNormal(Normal):
     """`Normal(loc, scale)` whose `rsample()` is `loc + scale * noise` when noise is given.
 
-    Noise drawn by the caller (keyed by step and scene, say) makes a step the same after a resume and however the batch is
-    spread over processes. Without noise it is the ordinary normal. KLs are those of `Normal`.
+    Noise drawn by the caller (keyed by step and scene, say) makes a step the same after a resume and however the batch
+    is spread over processes. Without noise it is the ordinary normal. KLs are those of `Normal`.
 
     Args:
         loc: mean.
@@ -35,15 +37,15 @@ class NoisyNormal(Normal):
         self.noise = noise
         super().__init__(loc, scale, validate_args=validate_args)
 
-    def expand(self, batch_shape, _instance=None) -> NoisyNormal:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> NoisyNormal:
         """The same distribution with a larger batch shape; the noise is shared by the new dimensions."""
         new = self._get_checked_instance(NoisyNormal, _instance)
         batch_shape = torch.Size(batch_shape)
         new.noise = None if self.noise is None else self.noise.expand(batch_shape)
         return super().expand(batch_shape, _instance=new)
 
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "..."]:
-        """Reparameterised sample. Raises `InputError` when more than the one sample is asked for that noise was given."""
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
+        """Reparameterised sample. Raises `InputError` when several are asked for and noise for one was given."""
         if self.noise is None:
             return super().rsample(sample_shape)
         if torch.Size(sample_shape) != torch.Size():
@@ -55,7 +57,7 @@ class NoisyNormal(Normal):
             )
         return self.loc + self.scale * self.noise
 
-    def sample(self, sample_shape=torch.Size()) -> Float[Tensor, "..."]:
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
         """Sample without gradient, from the same noise."""
         with torch.no_grad():
             return self.rsample(sample_shape)

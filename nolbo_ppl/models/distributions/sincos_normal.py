@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 import torch
 from jaxtyping import Float
 from pyro.distributions import TorchDistribution
@@ -14,7 +17,7 @@ from nolbo_ppl.models.distributions.wrapped_normal import wrapped_normal_moments
 
 
 def sincos_to_angle(sincos: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    """Project (sin, cos) to the circle: the angle in rad, so that the rotation built from it is one (method section 2)."""
+    """Project (sin, cos) to the circle: the angle in rad, from which a true rotation is built (method section 2)."""
     return torch.atan2(sincos[..., 0], sincos[..., 1])
 
 
@@ -30,7 +33,7 @@ class SinCosNormal(TorchDistribution):
     default, this one is the paper's. NOLBO eq. (meanvarofwrappedgaussian).
     """
 
-    arg_constraints = {"loc": constraints.real, "scale": constraints.positive}
+    arg_constraints: ClassVar = {"loc": constraints.real, "scale": constraints.positive}
     support = constraints.real_vector
     has_rsample = True
 
@@ -43,7 +46,7 @@ class SinCosNormal(TorchDistribution):
         self.loc, self.scale = broadcast_all(loc, scale)
         super().__init__(self.loc.shape, torch.Size((2,)), validate_args=validate_args)
 
-    def expand(self, batch_shape, _instance=None) -> SinCosNormal:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> SinCosNormal:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(SinCosNormal, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -68,13 +71,13 @@ class SinCosNormal(TorchDistribution):
         """Var[sin], Var[cos]."""
         return wrapped_normal_moments(self.loc, self.scale).variance
 
-    def log_prob(self, value: Float[Tensor, "... 2"]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "... 2"]) -> Float[Tensor, "*shape"]:
         """Log density in nats on the plane of (sin, cos)."""
         if self._validate_args:
             self._validate_sample(value)
         return self.factors.log_prob(value).sum(-1)
 
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 2"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 2"]:
         """Reparameterised (sin, cos); project it by `sincos_to_angle` before a rotation is built."""
         return self.factors.rsample(torch.Size(sample_shape))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -34,7 +36,7 @@ class SymmetricMatrixFisher(TorchDistribution):
     Method section 2 (symmetry).
     """
 
-    arg_constraints = {
+    arg_constraints: ClassVar = {
         "R_mode": rotation_constraint,
         "concentration": constraints.nonnegative,
         "order": constraints.nonnegative_integer,
@@ -59,7 +61,7 @@ class SymmetricMatrixFisher(TorchDistribution):
         self.order = order.expand(batch_shape)
         super().__init__(batch_shape, torch.Size((3, 3)), validate_args=validate_args)
 
-    def expand(self, batch_shape, _instance=None) -> SymmetricMatrixFisher:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> SymmetricMatrixFisher:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(SymmetricMatrixFisher, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -70,7 +72,7 @@ class SymmetricMatrixFisher(TorchDistribution):
         new._validate_args = self._validate_args
         return new
 
-    def log_prob(self, value: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "... 3 3"]) -> Float[Tensor, "*shape"]:
         """Log density in nats.
 
         Order n: logsumexp over the group. Order 0: with `M = R_mode' R`, `tr(M Rz(w)) = M_22 + b cos(w - w_0)`, whose
@@ -88,13 +90,13 @@ class SymmetricMatrixFisher(TorchDistribution):
         free = log_i0e(self.concentration * around) - self.concentration * between_axes
         return torch.where(self.order == 0, free, finite) - log_normalizer_excess(self.concentration)
 
-    def expected_log_prob(self, mean_rotation: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
+    def expected_log_prob(self, mean_rotation: Float[Tensor, "... 3 3"]) -> Float[Tensor, "*shape"]:
         """Lower bound of `E_q[log p(R_mode | R_z)]`, R_mode observed, R_z random with mean `mean_rotation`. Nats.
 
         The density is symmetric in the rotation and its mode. Order 1: exact, the log density is linear in R_z. Order
-        n: `logsumexp_g E[kappa tr(R_z' R g)] - log n - log c`; log-sum-exp is convex, so by Jensen it is no more than the
-        expectation (the responsibilities of the group elements are fixed instead of following R_z), and the evidence
-        bound stays one. Order 0 in the same way: `log I0(kappa b) + kappa M_22` of the mean M is convex in M.
+        n: `logsumexp_g E[kappa tr(R_z' R g)] - log n - log c`; log-sum-exp is convex, so by Jensen it is no more than
+        the expectation (the responsibilities of the group elements are fixed instead of following R_z), and the
+        evidence bound stays one. Order 0 likewise: `log I0(kappa b) + kappa M_22` of the mean M is convex in M.
         """
         M = mean_rotation.mT @ self.R_mode
         along, cosine, sine = M[..., 2, 2], M[..., 0, 0] + M[..., 1, 1], M[..., 0, 1] - M[..., 1, 0]
@@ -106,7 +108,7 @@ class SymmetricMatrixFisher(TorchDistribution):
         free = log_i0e(kappa * around) + kappa * (along + around - 3)
         return torch.where(self.order == 0, free, finite) - log_normalizer_excess(kappa)
 
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 3 3"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3 3"]:
         """Exact sample, reparameterised through mode and concentration; the turn is uniform over the group."""
         one = MatrixFisher(self.R_mode, self.concentration, validate_args=False).rsample(sample_shape)
         turn = torch.rand(one.shape[:-2], dtype=one.dtype, device=one.device)

@@ -1,8 +1,10 @@
-"""Distributions of a viewpoint (azimuth, elevation, in-plane rotation): the story's prior and the guides' posteriors."""
+"""Distributions of a viewpoint (azimuth, elevation, in-plane rotation): the story's prior and the guides."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +14,6 @@ from torch.distributions import constraints
 from torch.distributions.utils import broadcast_all
 
 from nolbo_ppl.geometry.rotation import viewpoint_moments_to_matrix, wrap_angle
-from nolbo_ppl.models.distributions.sincos_normal import SinCosNormal, sincos_to_angle
 from nolbo_ppl.models.distributions.von_mises import MAX_CONCENTRATION, VonMisesMixture
 from nolbo_ppl.models.distributions.wrapped_normal import WrappedNormal
 
@@ -32,7 +33,7 @@ class ViewpointNormal(TorchDistribution):
     Method sections 1 and 2; NOLBO appendix I.
     """
 
-    arg_constraints = {
+    arg_constraints: ClassVar = {
         "loc": constraints.independent(constraints.real, 1),
         "scale": constraints.independent(constraints.positive, 1),
     }
@@ -57,7 +58,7 @@ class ViewpointNormal(TorchDistribution):
         if self._validate_args and order is not None and not bool((order >= 0).all()):
             raise ValueError(f"Expected orders of symmetry of at least 0 (0 = free axis), got {order}")
 
-    def expand(self, batch_shape, _instance=None) -> ViewpointNormal:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> ViewpointNormal:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(ViewpointNormal, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -77,7 +78,7 @@ class ViewpointNormal(TorchDistribution):
         """The azimuth's wrapped normal, without the symmetry."""
         return WrappedNormal(self.loc[..., 0], self.scale[..., 0], validate_args=False)
 
-    def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "*shape"]:
         """Log density in nats per rad^3."""
         if self._validate_args:
             self._validate_sample(value)
@@ -92,7 +93,7 @@ class ViewpointNormal(TorchDistribution):
         azimuth = torch.where(self.order == 0, uniform, log_prob[..., 0])
         return azimuth + log_prob[..., 1:].sum(-1)
 
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 3"]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3"]:
         """Reparameterised sample; the element of the symmetry group is drawn uniformly and carries no gradient."""
         shape = self._extended_shape(sample_shape)
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
@@ -144,10 +145,10 @@ class ViewpointMixture(TorchDistribution):
         elevation_inplane_scale: their standard deviations in rad.
         max_concentration: limit of kappa, see `VonMisesMixture`.
 
-    Method section 3 (two objectives) and findings (second study).
+    Method section 3 (two objectives).
     """
 
-    arg_constraints = {
+    arg_constraints: ClassVar = {
         "logits": constraints.independent(constraints.real, 1),
         "natural": constraints.independent(constraints.real, 2),
         "elevation_inplane_loc": constraints.independent(constraints.real, 1),
@@ -173,7 +174,7 @@ class ViewpointMixture(TorchDistribution):
         self.elevation_inplane_scale = scale.expand(*batch_shape, 2)
         super().__init__(batch_shape, _EVENT, validate_args=validate_args)
 
-    def expand(self, batch_shape, _instance=None) -> ViewpointMixture:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> ViewpointMixture:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(ViewpointMixture, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -199,7 +200,7 @@ class ViewpointMixture(TorchDistribution):
         """The wrapped normals of elevation and in-plane rotation, batch shape (..., 2)."""
         return WrappedNormal(self.elevation_inplane_loc, self.elevation_inplane_scale, validate_args=False)
 
-    def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "*shape"]:
         """Log density in nats per rad^3."""
         if self._validate_args:
             self._validate_sample(value)
@@ -207,12 +208,12 @@ class ViewpointMixture(TorchDistribution):
 
     def log_prob_symmetric(
         self, value: Float[Tensor, "... 3"], order: Int[Tensor, "*#batch"] | int
-    ) -> Float[Tensor, "..."]:
+    ) -> Float[Tensor, "*shape"]:
         """Log density on the quotient by a symmetry about the vertical axis: azimuths that look the same are added."""
         azimuth = self.azimuth.log_prob_symmetric(value[..., 0], order)
         return azimuth + self.elevation_inplane.log_prob(value[..., 1:]).sum(-1)
 
-    def sample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 3"]:
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3"]:
         """Exact sample in [-pi, pi)."""
         with torch.no_grad():
             azimuth = self.azimuth.sample(sample_shape)
@@ -237,75 +238,3 @@ class ViewpointMixture(TorchDistribution):
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Differential entropy in nats (azimuth by quadrature)."""
         return self.azimuth.entropy() + self.elevation_inplane.entropy().sum(-1)
-
-
-class ViewpointSinCos(TorchDistribution):
-    """The paper's orientation latent: factorised Gaussians on (sin, cos) of each angle, event shape (3, 2).
-
-    Args:
-        loc: viewpoint (azimuth, elevation, in-plane) in rad.
-        scale: standard deviations in rad.
-
-    NOLBO appendix I, eq. (meanvarofwrappedgaussian).
-    """
-
-    arg_constraints = ViewpointNormal.arg_constraints
-    support = constraints.independent(constraints.real, 2)
-    has_rsample = True
-
-    def __init__(
-        self,
-        loc: Float[Tensor, "*#batch 3"],
-        scale: Float[Tensor, "*#batch 3"] | Float[Tensor, ""] | float,
-        validate_args: bool | None = None,
-    ) -> None:
-        self.loc, self.scale = broadcast_all(loc, scale)
-        super().__init__(self.loc.shape[:-1], torch.Size((3, 2)), validate_args=validate_args)
-
-    def expand(self, batch_shape, _instance=None) -> ViewpointSinCos:
-        """The same distribution with a larger batch shape."""
-        new = self._get_checked_instance(ViewpointSinCos, _instance)
-        batch_shape = torch.Size(batch_shape)
-        new.loc, new.scale = self.loc.expand(*batch_shape, 3), self.scale.expand(*batch_shape, 3)
-        super(ViewpointSinCos, new).__init__(batch_shape, self.event_shape, validate_args=False)
-        new._validate_args = self._validate_args
-        return new
-
-    @property
-    def angles(self) -> SinCosNormal:
-        """The three sine and cosine pairs, batch shape (..., 3)."""
-        return SinCosNormal(self.loc, self.scale, validate_args=False)
-
-    def log_prob(self, value: Float[Tensor, "... 3 2"]) -> Float[Tensor, "..."]:
-        """Log density in nats."""
-        if self._validate_args:
-            self._validate_sample(value)
-        return self.angles.log_prob(value).sum(-1)
-
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "... 3 2"]:
-        """Reparameterised (sin, cos) of each angle; `viewpoint_of` projects it before a rotation is built."""
-        return self.angles.rsample(sample_shape)
-
-    @staticmethod
-    def viewpoint_of(value: Float[Tensor, "*batch 3 2"]) -> Float[Tensor, "*batch 3"]:
-        """The viewpoint in rad of a sample, each pair projected to the circle."""
-        return sincos_to_angle(value)
-
-    @property
-    def mean(self) -> Float[Tensor, "*batch 3 2"]:
-        """E[sin], E[cos] of each angle."""
-        return self.angles.mean
-
-    @property
-    def variance(self) -> Float[Tensor, "*batch 3 2"]:
-        """Var[sin], Var[cos] of each angle."""
-        return self.angles.variance
-
-    def mean_rotation(self) -> Float[Tensor, "*batch 3 3"]:
-        """E[R_camera_object], allocentric, of the matrix built from the unprojected sines and cosines (linear: exact)."""
-        moments = self.mean
-        return viewpoint_moments_to_matrix(moments[..., 1], moments[..., 0])
-
-    def entropy(self) -> Float[Tensor, "*batch"]:
-        """Differential entropy in nats."""
-        return self.angles.entropy().sum(-1)

@@ -18,7 +18,8 @@ from torch.distributions.kl import register_kl
 
 from nolbo_ppl.models.distributions.sincos_normal import SinCosNormal
 from nolbo_ppl.models.distributions.symmetry import group_angles
-from nolbo_ppl.models.distributions.viewpoint import ViewpointMixture, ViewpointNormal, ViewpointSinCos
+from nolbo_ppl.models.distributions.viewpoint import ViewpointMixture, ViewpointNormal
+from nolbo_ppl.models.distributions.viewpoint_sincos import ViewpointSinCos
 from nolbo_ppl.models.distributions.von_mises_kl import kl_mixture_to_wrapped, kl_wrapped_to_mixture
 from nolbo_ppl.models.distributions.wrapped_normal import kl_of_angles
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -66,7 +68,7 @@ class VonMisesMixture(TorchDistribution):
     `q(v) = sum_k w_k exp(natural_k . (cos v, sin v)) / (2 pi I0(kappa_k))`. Mardia & Jupp, sections 3.5.4 and 5.5.
     """
 
-    arg_constraints = {
+    arg_constraints: ClassVar = {
         "logits": constraints.independent(constraints.real, 1),
         "natural": constraints.independent(constraints.real, 2),
     }
@@ -110,7 +112,7 @@ class VonMisesMixture(TorchDistribution):
         natural = concentration[..., None] * torch.stack((torch.cos(mean), torch.sin(mean)), -1)
         return cls(logits, natural, max_concentration)
 
-    def expand(self, batch_shape, _instance=None) -> VonMisesMixture:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> VonMisesMixture:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(VonMisesMixture, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -133,13 +135,13 @@ class VonMisesMixture(TorchDistribution):
         """Mean directions of the components in rad."""
         return torch.atan2(self._unit[..., 1], self._unit[..., 0])
 
-    def log_prob(self, value: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
         """Log density in nats per rad."""
         if self._validate_args:
             self._validate_sample(value)
         return self.log_density(value)
 
-    def log_density(self, value: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    def log_density(self, value: Float[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
         """`log_prob` of any real angle, periodic and not validated."""
         return _log_density(value, self._log_peak, self.concentration, self._unit)
 
@@ -158,8 +160,8 @@ class VonMisesMixture(TorchDistribution):
         return log_peak.flatten(-2), concentration.flatten(-2), unit.expand(*log_peak.shape, 2).flatten(-3, -2)
 
     def log_prob_symmetric(
-        self, value: Float[Tensor, "..."], order: Int[Tensor, "*#batch"] | int
-    ) -> Float[Tensor, "..."]:
+        self, value: Float[Tensor, "*value"], order: Int[Tensor, "*#batch"] | int
+    ) -> Float[Tensor, "*shape"]:
         """Log density of the azimuth of an object with a symmetry: `log sum_j q(v + 2 pi j / order)`.
 
         This is the density on the quotient of the circle by the group, an arc of 2 pi / order. Order 0, free about the
@@ -169,7 +171,7 @@ class VonMisesMixture(TorchDistribution):
         log_density = _log_density(value, *self.folded(order))
         return torch.where(order == 0, torch.zeros_like(log_density), log_density)
 
-    def sample(self, sample_shape=torch.Size()) -> Float[Tensor, "..."]:
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
         """Exact sample: a component, then Best & Fisher's rejection sampler."""
         with torch.no_grad():
             component = Categorical(logits=self.log_weights, validate_args=False).sample(torch.Size(sample_shape))
@@ -250,8 +252,8 @@ class VonMisesMixture(TorchDistribution):
         return -(log_density.exp() * log_density).sum(0) * (2 * math.pi / nodes)
 
     def hpd_mass(
-        self, value: Float[Tensor, "..."], order: Int[Tensor, "*#batch"] | int = 1, nodes: int = 1024
-    ) -> Float[Tensor, "..."]:
+        self, value: Float[Tensor, "*value"], order: Int[Tensor, "*#batch"] | int = 1, nodes: int = 1024
+    ) -> Float[Tensor, "*shape"]:
         """Probability of all angles with a density above that at `value`, folded by the symmetry group.
 
         `value` is inside the highest-density region of probability c exactly where this is at most c, so over truths

@@ -79,14 +79,14 @@ def kl_mixture_to_wrapped(
 ) -> Float[Tensor, "*batch"]:
     """KL(q || p) in nats, p the equal mixture of the wrapped normal over the symmetry group: the paper's direction.
 
-    The log density of p is taken in the tangent at its nearest mode, `-d^2 / (2 scale^2) - log(n scale sqrt(2 pi))` with
+    The log density of p is taken in the tangent at its nearest mode, `-d^2 / (2 scale^2) - log(n scale sqrt(2 pi))`,
     d the difference wrapped to the period 2 pi / n. The neglected modes only add density, so this bounds the KL from
     above and agrees with it for a scale small beside the period. Order 0 (free axis) gives zero.
     Quadrature on the circle anchored at the mean of p, exponentially accurate (`_squared_angle_weights`).
     """
     order = torch.as_tensor(order, device=p.loc.device)
     nodes = nodes or default_nodes(q.max_concentration, p.loc.dtype)
-    table = torch.as_tensor(_squared_angle_weights(nodes, max(1, int(order.max()))), dtype=p.loc.dtype, device=p.loc.device)
+    table = torch.as_tensor(_squared_angle_weights(nodes, int(order.max()))).to(p.loc)
     shape = torch.broadcast_shapes(p.batch_shape, q.batch_shape, order.shape)
     grid = torch.arange(nodes, dtype=p.loc.dtype, device=p.loc.device) * (2 * math.pi / nodes) - math.pi
     log_q = q.log_density(p.loc + grid.reshape((-1,) + (1,) * len(shape)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -58,7 +59,7 @@ class WrappedNormal(TorchDistribution):
     Source: Mardia & Jupp, Directional Statistics, section 3.5.7.
     """
 
-    arg_constraints = {"loc": constraints.real, "scale": constraints.positive}
+    arg_constraints: ClassVar = {"loc": constraints.real, "scale": constraints.positive}
     support = constraints.interval(-math.pi, math.pi)
     has_rsample = True
 
@@ -71,7 +72,7 @@ class WrappedNormal(TorchDistribution):
         self.loc, self.scale = broadcast_all(loc, scale)
         super().__init__(self.loc.shape, validate_args=validate_args)
 
-    def expand(self, batch_shape, _instance=None) -> WrappedNormal:
+    def expand(self, batch_shape: Sequence[int], _instance: object = None) -> WrappedNormal:
         """The same distribution with a larger batch shape."""
         new = self._get_checked_instance(WrappedNormal, _instance)
         batch_shape = torch.Size(batch_shape)
@@ -80,14 +81,14 @@ class WrappedNormal(TorchDistribution):
         new._validate_args = self._validate_args
         return new
 
-    def log_prob(self, value: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    def log_prob(self, value: Float[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
         """Exact log density in nats per rad: a sum over wraps when narrow, over harmonics when wide."""
         if self._validate_args:
             self._validate_sample(value)
         difference = wrap_angle(value - self.loc)
         return _log_density(difference, self.scale)
 
-    def rsample(self, sample_shape=torch.Size()) -> Float[Tensor, "..."]:
+    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
         """Reparameterised sample in [-pi, pi)."""
         shape = self._extended_shape(sample_shape)
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
