@@ -14,7 +14,7 @@ def component_log_prob(
 ) -> Float[Tensor, "*batch C"]:
     """`log N(value; mu_c, I)` in nats for every component, NOLBO appendix I.
 
-    The squared distance is one matrix product about the mean of the components; its error is 1e-7 of their spread squared.
+    The squared distance is one matrix product about the mean of the components, wrong by 1e-7 of their squared spread.
     """
     centre = component_loc.detach().mean(0)
     value, component_loc = value - centre, component_loc - centre

@@ -17,6 +17,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 from torch.distributions.kl import register_kl
+from torch.types import _size
 
 from nolbo_ppl.models.distributions.bessel import bessel_gap, bessel_ratio_over_x, gap_excess, log_i0e
 
@@ -134,7 +135,7 @@ class MatrixFisher(TorchDistribution):
         misfit = 3 - (mean_rotation * self.R_mode).sum((-2, -1))
         return -self.concentration * misfit - log_normalizer_excess(self.concentration)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3 3"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "... 3 3"]:
         """Exact sample, reparameterised through the mode and, by implicit differentiation, the concentration."""
         shape = self._extended_shape(sample_shape)[:-2]
         concentration = self.concentration.expand(shape)

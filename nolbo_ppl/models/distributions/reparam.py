@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pyro.distributions import Normal
 from torch import Tensor
 from torch.distributions.utils import broadcast_all
+from torch.types import _size
 
 from nolbo_ppl.errors import input_error
 
@@ -44,7 +45,7 @@ class NoisyNormal(Normal):
         new.noise = None if self.noise is None else self.noise.expand(batch_shape)
         return super().expand(batch_shape, _instance=new)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "*shape"]:
         """Reparameterised sample. Raises `InputError` when several are asked for and noise for one was given."""
         if self.noise is None:
             return super().rsample(sample_shape)
@@ -57,7 +58,7 @@ class NoisyNormal(Normal):
             )
         return self.loc + self.scale * self.noise
 
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
+    def sample(self, sample_shape: _size = ()) -> Float[Tensor, "*shape"]:
         """Sample without gradient, from the same noise."""
         with torch.no_grad():
             return self.rsample(sample_shape)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Normal, constraints, kl_divergence
 from torch.distributions.kl import register_kl
 from torch.distributions.utils import broadcast_all
+from torch.types import _size
 
 from nolbo_ppl.models.distributions.wrapped_normal import wrapped_normal_moments
 
@@ -77,7 +78,7 @@ class SinCosNormal(TorchDistribution):
             self._validate_sample(value)
         return self.factors.log_prob(value).sum(-1)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 2"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "... 2"]:
         """Reparameterised (sin, cos); project it by `sincos_to_angle` before a rotation is built."""
         return self.factors.rsample(torch.Size(sample_shape))
 

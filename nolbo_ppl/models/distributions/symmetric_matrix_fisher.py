@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
+from torch.types import _size
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.distributions.bessel import log_i0e
@@ -108,7 +109,7 @@ class SymmetricMatrixFisher(TorchDistribution):
         free = log_i0e(kappa * around) + kappa * (along + around - 3)
         return torch.where(self.order == 0, free, finite) - log_normalizer_excess(kappa)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3 3"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "... 3 3"]:
         """Exact sample, reparameterised through mode and concentration; the turn is uniform over the group."""
         one = MatrixFisher(self.R_mode, self.concentration, validate_args=False).rsample(sample_shape)
         turn = torch.rand(one.shape[:-2], dtype=one.dtype, device=one.device)

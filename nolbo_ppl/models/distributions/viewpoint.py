@@ -12,6 +12,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 from torch.distributions.utils import broadcast_all
+from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import viewpoint_moments_to_matrix, wrap_angle
 from nolbo_ppl.models.distributions.von_mises import MAX_CONCENTRATION, VonMisesMixture
@@ -93,7 +94,7 @@ class ViewpointNormal(TorchDistribution):
         azimuth = torch.where(self.order == 0, uniform, log_prob[..., 0])
         return azimuth + log_prob[..., 1:].sum(-1)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "... 3"]:
         """Reparameterised sample; the element of the symmetry group is drawn uniformly and carries no gradient."""
         shape = self._extended_shape(sample_shape)
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
@@ -213,7 +214,7 @@ class ViewpointMixture(TorchDistribution):
         azimuth = self.azimuth.log_prob_symmetric(value[..., 0], order)
         return azimuth + self.elevation_inplane.log_prob(value[..., 1:]).sum(-1)
 
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3"]:
+    def sample(self, sample_shape: _size = ()) -> Float[Tensor, "... 3"]:
         """Exact sample in [-pi, pi)."""
         with torch.no_grad():
             azimuth = self.azimuth.sample(sample_shape)

@@ -11,6 +11,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 from torch.distributions.utils import broadcast_all
+from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import viewpoint_moments_to_matrix
 from nolbo_ppl.models.distributions.sincos_normal import SinCosNormal, sincos_to_angle
@@ -62,7 +63,7 @@ class ViewpointSinCos(TorchDistribution):
             self._validate_sample(value)
         return self.angles.log_prob(value).sum(-1)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "... 3 2"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "... 3 2"]:
         """Reparameterised (sin, cos) of each angle; `viewpoint_of` projects it before a rotation is built."""
         return self.angles.rsample(sample_shape)
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import Categorical, VonMises, constraints
+from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import wrap_angle
 from nolbo_ppl.models.distributions.bessel import bessel_ratio_over_x, log_i0e
@@ -171,7 +172,7 @@ class VonMisesMixture(TorchDistribution):
         log_density = _log_density(value, *self.folded(order))
         return torch.where(order == 0, torch.zeros_like(log_density), log_density)
 
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
+    def sample(self, sample_shape: _size = ()) -> Float[Tensor, "*shape"]:
         """Exact sample: a component, then Best & Fisher's rejection sampler."""
         with torch.no_grad():
             component = Categorical(logits=self.log_weights, validate_args=False).sample(torch.Size(sample_shape))

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import constraints
 from torch.distributions.kl import register_kl
 from torch.distributions.utils import broadcast_all
+from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import wrap_angle
 
@@ -88,7 +89,7 @@ class WrappedNormal(TorchDistribution):
         difference = wrap_angle(value - self.loc)
         return _log_density(difference, self.scale)
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Float[Tensor, "*shape"]:
+    def rsample(self, sample_shape: _size = ()) -> Float[Tensor, "*shape"]:
         """Reparameterised sample in [-pi, pi)."""
         shape = self._extended_shape(sample_shape)
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
