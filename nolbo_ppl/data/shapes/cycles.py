@@ -34,7 +34,7 @@ def bicycle(b: Builder, d: Draw) -> int:
         for i in range(4):
             a = math.pi * i / 4 + 0.2
             v, w = (wheel - 2.2 * tyre) * math.cos(a), (wheel - 2.2 * tyre) * math.sin(a)
-            b.tube("metal", [(0, y - v, wheel - w), (0, y + v, wheel + w)], 0.003, segments=3)
+            b.tube("metal", [(0, y - v, wheel - w), (0, y + v, wheel + w)], 0.003, segments=3, decal=True)
     # Frame: down tube, seat tube, top tube (low on a step-through), stays, fork.
     b.tube("body", [bottom, head_low], tube)
     b.tube("body", [bottom, crossing], tube)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nolbo_ppl.data.shapes.polygon import Points, grid_inside, half_thickness, signed_area, triangulate
+from nolbo_ppl.data.shapes.polygon import Points, following, grid_inside, half_thickness, signed_area, triangulate
 from nolbo_ppl.errors import input_error
 
 Axis = Float[np.ndarray, " n"]
@@ -51,14 +52,33 @@ def _from_plane(axis: int, grid_uvw: np.ndarray) -> np.ndarray:
     return grid_uvw if axis == 0 else grid_uvw.transpose(1, 0, 2) if axis == 1 else grid_uvw.transpose(1, 2, 0)
 
 
-def _rings_to_faces(rings: int, segments: int, closed: bool = False) -> np.ndarray:
-    """Faces between consecutive rings of `segments` vertices each; [bands * segments * 2, 3], band by band."""
-    ring, corner = np.meshgrid(np.arange(rings if closed else rings - 1), np.arange(segments), indexing="ij")
+@lru_cache(maxsize=256)
+def _rings_to_faces(rings: int, segments: int, capped: bool) -> np.ndarray:
+    """Faces [f, 3] between consecutive rings of `segments` vertices each, band by band, outside to the right.
+
+    `capped` closes the ends by two fans; otherwise the last ring is joined to the first.
+    """
+    ring, corner = np.meshgrid(np.arange(rings - 1 if capped else rings), np.arange(segments), indexing="ij")
     a = ring * segments + corner
     b = ring * segments + (corner + 1) % segments
     above = (ring + 1) % rings * segments
     c, d = above + (corner + 1) % segments, above + corner
-    return np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+    faces = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)], axis=2).reshape(-1, 3)
+    if capped:
+        fan = np.array([(0, i, i + 1) for i in range(1, segments - 1)])
+        faces = np.concatenate([faces, fan[:, ::-1], fan + (rings - 1) * segments])
+    faces.flags.writeable = False
+    return faces
+
+
+@lru_cache(maxsize=64)
+def _prism_sides(n: int) -> np.ndarray:
+    """Two triangles [2 n, 3] for each edge of a prism over n corners, the upper corners numbered from n."""
+    i = np.arange(n)
+    j = (i + 1) % n
+    faces = np.stack([np.stack([i, j, j + n], -1), np.stack([i, j + n, i + n], -1)], axis=1).reshape(-1, 3)
+    faces.flags.writeable = False
+    return faces
 
 
 @dataclass(frozen=True)
@@ -84,6 +104,7 @@ class Extrusion:
     roles: tuple[str, ...]
     cap_roles: tuple[str, str]
     _half: float = field(init=False, repr=False)
+    _is_box: bool = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         profile = np.asarray(self.profile, dtype=np.float64)
@@ -95,6 +116,8 @@ class Extrusion:
         object.__setattr__(self, "profile", profile)
         object.__setattr__(self, "roles", roles)
         object.__setattr__(self, "_half", half_thickness(profile))
+        upright = len(profile) == 4 and bool(((profile == profile.min(0)) | (profile == profile.max(0))).all())
+        object.__setattr__(self, "_is_box", upright and not any((*self.low[1:], *self.high[1:])))
         if (self._plane(self.low) > self._plane(self.high) + 1e-12).any():
             raise input_error("planes of an extrusion cross inside its profile", got=(self.low, self.high))
 
@@ -114,21 +137,22 @@ class Extrusion:
         vertices = np.concatenate(
             [_to_world(self.axis, self._plane(plane), v, w) for plane in (self.low, self.high)]
         )
-        caps = triangulate(self.profile)
-        faces = [(a, c, b) for a, b, c in caps] + [(a + n, b + n, c + n) for a, b, c in caps]
+        caps = np.array(triangulate(self.profile))
+        faces = np.concatenate([caps[:, ::-1], caps + n, _prism_sides(n)])
         names = [self.cap_roles[0]] * len(caps) + [self.cap_roles[1]] * len(caps)
-        for i in range(n):
-            j = (i + 1) % n
-            faces += [(i, j, j + n), (i, j + n, i + n)]
-            names += [self.roles[i]] * 2
-        array = np.array(faces)
-        return vertices, array[:, ::-1] if self.axis == 1 else array, names
+        names += [role for role in self.roles for _ in range(2)]
+        return vertices, faces[:, ::-1] if self.axis == 1 else faces, names
 
     def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
-        """A polygon test on the plane and two comparisons in space."""
+        """A polygon test on the plane and two comparisons in space; a box is three intervals."""
         grid = (x, y, z)
         u = grid[self.axis]
         v, w = (grid[i] for i in PLANE_AXES[self.axis])
+        if self._is_box:
+            low, high = self.bounds()
+            extra = np.maximum(thin - 0.5 * (high - low), 0.0)
+            within = [(c >= a) & (c <= b) for c, a, b in zip(grid, low - extra, high + extra)]
+            return (within[0][:, None] & within[1])[:, :, None] & within[2]
         mask = grid_inside(self.profile, v, w, margin=max(thin - self._half, 0.0))
         low, high = (p[0] + p[1] * v[:, None] + p[2] * w[None, :] for p in (self.low, self.high))
         extra = np.maximum(thin - 0.5 * (high - low), 0.0)
@@ -182,8 +206,7 @@ class Loft:
         k, n = len(self.stations), len(ring)
         plane = (self.centre[:, None] + self.half[:, None] * ring).reshape(-1, 2)
         vertices = _to_world(self.axis, np.repeat(self.stations, n), plane[:, 0], plane[:, 1])
-        fan = np.array([(0, i, i + 1) for i in range(1, n - 1)])
-        faces = np.concatenate([_rings_to_faces(k, n), fan[:, ::-1], fan + (k - 1) * n])
+        faces = _rings_to_faces(k, n, capped=True)
         names = [role for role in self.roles for _ in range(2 * n)]
         names += [self.cap_roles[0]] * (n - 2) + [self.cap_roles[1]] * (n - 2)
         return vertices, faces[:, ::-1] if self.axis == 1 else faces, names
@@ -203,7 +226,7 @@ class Loft:
             inside = a[:, :, None] <= (1.0 - b)[:, None, :]
         else:
             ring = self._ring()
-            edge = np.roll(ring, -1, axis=0) - ring
+            edge = following(ring) - ring
             inside = np.ones((len(u), len(v), len(w)), dtype=bool)
             for (p, q), (dp, dq) in zip(ring, edge):
                 inside &= ((a - p) * dq)[:, :, None] <= ((b - q) * dp)[:, None, :]
@@ -250,8 +273,7 @@ class Tube:
             )
             rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up))
         k, n = len(self.path), self.segments
-        fan = np.array([(0, i, i + 1) for i in range(1, n - 1)])
-        faces = np.concatenate([_rings_to_faces(k, n), fan[:, ::-1], fan + (k - 1) * n])
+        faces = _rings_to_faces(k, n, capped=True)
         return np.concatenate(rings), faces, [self.role] * len(faces)
 
     def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
@@ -315,7 +337,7 @@ class Torus:
         radius = (self.ring + self.tube * np.cos(across)).ravel()
         v, w = radius * np.cos(around.ravel()), radius * np.sin(around.ravel())
         vertices = _to_world(self.axis, self.tube * np.sin(across.ravel()), v, w) + np.array(self.centre)
-        faces = _rings_to_faces(n, m, closed=True)
+        faces = _rings_to_faces(n, m, capped=False)
         return vertices, faces if self.axis == 1 else faces[:, ::-1], [self.role] * len(faces)
 
     def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
