@@ -1,0 +1,127 @@
+"""Settings of the object SLAM, and the problem it solves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from nolbo_ppl.categories import CATEGORY_SYMMETRY
+from nolbo_ppl.data.observations import ObservationTable, check_table
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import is_rotation
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """How objects are tracked, associated and mapped. None: estimated from the data."""
+
+    odometry_rotation_scale: float | None = None
+    """Standard deviation of each angle of one odometry step, rad."""
+    odometry_translation_scale: float | None = None
+    """Standard deviation of each coordinate of one odometry step, m."""
+    odometry_translation_ratio: float | None = None
+    """The part of it that grows with the length of the step, m per m."""
+    position_scale: float | None = None
+    """Standard deviation of an observed position at range 0, m, for observations that state none."""
+    position_ratio: float | None = None
+    """Its growth with range, m per m."""
+    rotation_scale: float | None = None
+    """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
+    latent_scale: float | None = None
+    """Standard deviation of a latent coordinate, for observations that state none."""
+    new_rate: float | None = None
+    """Density of landmarks not seen before, per m^3 of the observed space."""
+    clutter_rate: float | None = None
+    """Density of false detections, per m^3 of the observed space and frame."""
+    objectness_limits: tuple[float, float] = (0.02, 0.98)
+    """Objectness is clipped to this, so that background always remains possible."""
+    correct_scales: bool = True
+    """Raise stated scales that the data show to be too small (always reported)."""
+    flip_probability: float = 0.03
+    """Prior probability that an orientation is turned by 180 degrees about the object's vertical axis."""
+    orientation_outlier: float = 0.05
+    """Prior probability that an orientation says nothing."""
+    category_error: float = 0.05
+    """Prior probability that a category is wrong."""
+    category_symmetry: Mapping[str, int] = field(default_factory=lambda: dict(CATEGORY_SYMMETRY))
+    """Symmetry about the object's vertical axis by category, where an observation declares none."""
+    track_gap: int = 8
+    """A short-term track ends after this many frames without a detection."""
+    track_minimum: int = 2
+    """Tracks with fewer detections found no landmark."""
+    motion_log_odds: float = 8.0
+    """A track whose motion is favoured by more than this many nats is moving, and not used."""
+    samples: int = 64
+    """Posterior samples of the linearised graph that carry all relative covariances."""
+    annealing: tuple[float, ...] = (4.0, 2.0, 1.0)
+    """Factors on the relative covariances in the first rounds; the last one stays."""
+    constellation_size: int = 14
+    """Tracklets a fresh constellation is made of."""
+    constellation_minimum: int = 3
+    """Pairs that must agree to close a loop by constellation."""
+    constellation_log_odds: float = 8.0
+    """Log evidence, in nats above new landmarks, that a constellation must reach."""
+    constellation_rounds: int = 8
+    """Most rounds of constellation closing."""
+    em_iterations: int = 4
+    """Iterations of the soft EM between tracklets after that."""
+    link_minimum: float = 0.02
+    """Links of lower weight are left out of the M-step."""
+    merge_weight: float = 0.5
+    """Tracklets linked by more than this become one landmark."""
+    robust_width: float = 1.0
+    """Width of the Cauchy kernel on links between tracklets, in standard deviations."""
+    seed: int = 0
+    """Seed of the posterior samples."""
+    associator: str = "exact"
+    """How association marginals are computed (see `nolbo_ppl.inference.association`)."""
+
+
+@dataclass(frozen=True)
+class SlamProblem:
+    """Odometry and observations of one drive."""
+
+    odometry: Float[np.ndarray, "n 4 4"]
+    """Drifting T_world_camera, one row a frame."""
+    observations: ObservationTable
+    """Detections in these frames, rows in any order."""
+
+    def __post_init__(self) -> None:
+        T = self.odometry
+        if T.ndim != 3 or T.shape[1:] != (4, 4) or len(T) == 0:
+            raise input_error("odometry is no trajectory", got=f"shape {T.shape}", expected="[n, 4, 4], n at least 1")
+        bad = ~np.isfinite(T).all(axis=(1, 2)) | ~is_rotation(np.nan_to_num(T[:, :3, :3]))
+        if bad.any():
+            raise input_error("odometry holds a row that is no pose", got=T[int(np.argmax(bad))],
+                              expected="finite, orthonormal", do=f"look at row {int(np.argmax(bad))}")
+        check_table(self.observations, len(T))
+
+    def __len__(self) -> int:
+        return len(self.odometry)
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """The standard deviations in use, after estimation and correction."""
+
+    rotation_step: Float[np.ndarray, "n-1"]
+    """Standard deviation of each angle of each odometry step, rad."""
+    translation_step: Float[np.ndarray, "n-1"]
+    """Standard deviation of each coordinate of each odometry step, m."""
+    position_covariance: Float[np.ndarray, "k 3 3"]
+    """Covariance of every observed position in its camera frame, m^2."""
+    rotation_scale: Float[np.ndarray, "k"]
+    """Standard deviation of every observed angle, rad."""
+    latent_scale: Float[np.ndarray, "k d"]
+    """Standard deviation of every latent coordinate."""
+    new_rate: float
+    """Landmarks not seen before, per m^3."""
+    clutter_rate: float
+    """False detections, per m^3 and frame."""
+    report: dict[str, float]
+    """Estimated values by name."""
+    warnings: tuple[str, ...] = ()
+    """Stated scales found too small, in words."""

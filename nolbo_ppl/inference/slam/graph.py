@@ -1,0 +1,281 @@
+"""The factor graph in GTSAM: poses, landmarks, odometry, observations with their weights, links between landmarks.
+
+Every landmark is a Pose3, also where no orientation is observed: a `BetweenFactorPose3` then carries a rotation part so
+loose (10 rad) that it says nothing. It converges in 5 iterations where points with bearing and range take 16. Weights sit
+in the noise models (scale / sqrt(w)) and are frozen while the graph is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from jaxtyping import Float, Int
+
+from nolbo_ppl.errors import NolboError
+from nolbo_ppl.geometry.pose import make_pose, relative, so3_log
+from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, nearest_mode_rotation, resolved_symmetry
+
+LOOSE_ROTATION = 10.0
+"""Scale of a rotation nobody observed, rad."""
+PRIOR_ROTATION, PRIOR_POSITION_RATIO = 1.0, 1e3
+"""Weak prior of each landmark about its first estimate: rad, and the multiple of the typical range in m."""
+GAUGE_SCALE = 1e-5
+"""Scale of the prior that fixes the first pose, rad and m."""
+
+
+class GraphError(NolboError, RuntimeError):
+    """GTSAM could not solve the graph; the message names the pose or landmark."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Values of all variables."""
+
+    T_world_camera: Float[np.ndarray, "n 4 4"]
+    """Camera poses."""
+    T_world_landmark: Float[np.ndarray, "m 4 4"]
+    """Landmark poses; the rotation means nothing where none is observed."""
+
+
+@dataclass(frozen=True)
+class ObservationFactors:
+    """Relative pose measurements of landmarks, ready for the graph."""
+
+    frame: Int[np.ndarray, "k"]
+    """Pose each hangs on."""
+    landmark: Int[np.ndarray, "k"]
+    """Landmark each hangs on."""
+    T_camera_landmark: Float[np.ndarray, "k 4 4"]
+    """Measured pose, symmetry and flips resolved."""
+    covariance: Float[np.ndarray, "k 6 6"]
+    """Covariance [rotation, position] in the measured landmark's frame, rad^2 and m^2."""
+    weight: Float[np.ndarray, "k"]
+    """Frozen weight."""
+
+
+@dataclass(frozen=True)
+class Links:
+    """Soft equality of two landmarks."""
+
+    a: Int[np.ndarray, "l"]
+    """Newer landmark."""
+    b: Int[np.ndarray, "l"]
+    """Older landmark."""
+    weight: Float[np.ndarray, "l"]
+    """Probability that both are one object."""
+    T_a_b: Float[np.ndarray, "l 4 4"]
+    """Identity, or the half turn or symmetry between the two landmarks' frames."""
+    scale: Float[np.ndarray, "l 2"]
+    """Scales of rotation in rad and of position in m."""
+
+    @staticmethod
+    def none() -> Links:
+        """No links."""
+        return Links(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 2)))
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+
+def pose_key(i: int) -> int:
+    """GTSAM key of pose i."""
+    return gtsam.symbol("x", int(i))
+
+
+def landmark_key(j: int) -> int:
+    """GTSAM key of landmark j."""
+    return gtsam.symbol("l", int(j))
+
+
+def resolve_observations(
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, estimate: Estimate, rows: Int[np.ndarray, "k"],
+    landmark: Int[np.ndarray, "k"], weight: Float[np.ndarray, "k"],
+) -> ObservationFactors:
+    """Measured relative poses of the given detections: the orientation mode nearest to the estimate, loose where none.
+
+    An orientation nearer to the uniform part of its likelihood than to any mode is dropped (its position stays).
+    """
+    table = problem.observations
+    frame = table.frame[rows]
+    predicted = relative(estimate.T_world_camera[frame], estimate.T_world_landmark[landmark])[:, :3, :3]
+    oriented = table.has_rotation[rows]
+    observed = np.where(oriented[:, None, None], np.nan_to_num(table.rotation[rows]), predicted)
+    # Without an orientation the landmark's axes are the odometry's world axes: constant, so that the graph is too.
+    R_world_camera = problem.odometry[frame, :3, :3]
+    observed = np.where(oriented[:, None, None], observed, np.swapaxes(R_world_camera, 1, 2))
+    symmetry = np.where(oriented, resolved_symmetry(table, config)[rows], 1)
+    scale = noise.rotation_scale[rows]
+    if oriented.any():
+        o = np.flatnonzero(oriented)
+        observed[o] = nearest_mode_rotation(predicted[o], observed[o], symmetry[o])
+        error = so3_log(np.swapaxes(predicted[o], 1, 2) @ observed[o])
+        error[symmetry[o] == 0, 2] = 0.0
+        log_mode = -0.5 * np.sum(error**2, axis=1) / scale[o] ** 2 - 1.5 * np.log(2 * np.pi * scale[o] ** 2)
+        lost = log_mode + np.log1p(-config.orientation_outlier) < np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY
+        oriented[o[lost]] = False
+        observed[o[lost]] = predicted[o[lost]]
+    covariance = np.zeros((len(rows), 6, 6))
+    angular = np.where(oriented, scale, LOOSE_ROTATION)
+    covariance[:, [0, 1, 2], [0, 1, 2]] = (angular**2)[:, None]
+    covariance[oriented & (symmetry == 0), 2, 2] = LOOSE_ROTATION**2
+    covariance[:, 3:, 3:] = np.swapaxes(observed, 1, 2) @ noise.position_covariance[rows] @ observed
+    return ObservationFactors(frame, landmark, make_pose(observed, table.position[rows]), covariance, weight)
+
+
+def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.NonlinearFactorGraph:
+    """Gauge prior on the first pose and one factor a step."""
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(problem.odometry[0]),
+                                     gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE)))
+    steps = relative(problem.odometry[:-1], problem.odometry[1:])
+    for i, (step, rotation, translation) in enumerate(zip(steps, noise.rotation_step, noise.translation_step)):
+        sigmas = np.array([rotation] * 3 + [translation] * 3)
+        graph.add(gtsam.BetweenFactorPose3(pose_key(i), pose_key(i + 1), gtsam.Pose3(step),
+                                           gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    return graph
+
+
+def add_observation_factors(graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3) -> None:
+    """One factor a detection, its covariance divided by its weight; weights below `minimum` are left out."""
+    covariance = factors.covariance / np.maximum(factors.weight, 1e-12)[:, None, None]
+    # One batched factorisation here, so that GTSAM checks nothing and prints nothing.
+    information = np.linalg.inv(np.linalg.cholesky(covariance))
+    for k in np.flatnonzero(factors.weight > minimum):
+        graph.add(gtsam.BetweenFactorPose3(
+            pose_key(factors.frame[k]), landmark_key(factors.landmark[k]), gtsam.Pose3(factors.T_camera_landmark[k]),
+            gtsam.noiseModel.Gaussian.SqrtInformation(information[k], False)))
+
+
+def add_landmark_priors(
+    graph: gtsam.NonlinearFactorGraph, T_world_landmark: Float[np.ndarray, "m 4 4"], typical_range: float
+) -> None:
+    """Weak prior on each landmark, so that no system is ever indeterminate."""
+    sigmas = np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [PRIOR_POSITION_RATIO * max(typical_range, 1e-3)] * 3)
+    model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    for j, T in enumerate(T_world_landmark):
+        graph.add(gtsam.PriorFactorPose3(landmark_key(j), gtsam.Pose3(T), model))
+
+
+def add_links(graph: gtsam.NonlinearFactorGraph, links: Links, robust_width: float | None) -> None:
+    """Between-factors of linked landmarks, weighted; under a Cauchy kernel when a width is given."""
+    for k in range(len(links)):
+        sigmas = np.repeat(links.scale[k], 3) / np.sqrt(max(links.weight[k], 1e-12))
+        model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        if robust_width is not None:
+            model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(robust_width), model)
+        graph.add(gtsam.BetweenFactorPose3(landmark_key(links.a[k]), landmark_key(links.b[k]),
+                                           gtsam.Pose3(links.T_a_b[k]), model))
+
+
+def to_values(estimate: Estimate) -> gtsam.Values:
+    """GTSAM values of an estimate."""
+    values = gtsam.Values()
+    for i, T in enumerate(estimate.T_world_camera):
+        values.insert(pose_key(i), gtsam.Pose3(T))
+    for j, T in enumerate(estimate.T_world_landmark):
+        values.insert(landmark_key(j), gtsam.Pose3(T))
+    return values
+
+
+def from_values(values: gtsam.Values, poses: int, landmarks: int) -> Estimate:
+    """An estimate of GTSAM values."""
+    camera = np.array([values.atPose3(pose_key(i)).matrix() for i in range(poses)]).reshape(poses, 4, 4)
+    landmark = np.array([values.atPose3(landmark_key(j)).matrix() for j in range(landmarks)]).reshape(landmarks, 4, 4)
+    return Estimate(camera, landmark)
+
+
+def _named(error: RuntimeError) -> GraphError:
+    """Turn GTSAM's complaint into one that names the variable."""
+    text = " ".join(str(error).split())
+    return GraphError(f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)")
+
+
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, estimate: Estimate, *, iterations: int = 20, relative_tolerance: float = 1e-5
+) -> tuple[Estimate, float, float]:
+    """Levenberg-Marquardt from an estimate; the new one and the error (half squared, whitened) before and after.
+
+    Raises:
+        GraphError: GTSAM could not solve it; names the variable.
+    """
+    values = to_values(estimate)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(relative_tolerance)
+    parameters.setVerbosityLM("SILENT")
+    try:
+        before = graph.error(values)
+        result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+        after = graph.error(result)
+    except RuntimeError as error:
+        raise _named(error) from None
+    if not np.isfinite(after) or after > before:
+        return estimate, before, before
+    return from_values(result, len(estimate.T_world_camera), len(estimate.T_world_landmark)), before, after
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A linearised graph, factorised once: samples, marginals and joint covariances of any variables.
+
+    Columns of the system: landmarks in order, then poses in order (GTSAM sorts its keys: 'l' before 'x'), six each.
+    """
+
+    landmarks: int
+    """Number of landmarks."""
+    poses: int
+    """Number of poses."""
+    jacobian: scipy.sparse.csc_matrix
+    """Whitened Jacobian."""
+    factor: scipy.sparse.linalg.SuperLU
+    """Factorisation of its normal matrix."""
+
+    def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
+        """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""
+        noise = rng.standard_normal((self.jacobian.shape[0], count))
+        delta = self.factor.solve(self.jacobian.T @ noise).reshape(-1, 6, count)
+        return delta[self.landmarks :], delta[: self.landmarks]
+
+    def covariance(self, blocks: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 6 6"]:
+        """Marginal covariances of the given blocks (landmark j: j; pose i: landmarks + i)."""
+        out = np.empty((len(blocks), 6, 6))
+        size = self.jacobian.shape[1]
+        for start in range(0, len(blocks), 64):
+            chunk = np.asarray(blocks[start : start + 64])
+            right = np.zeros((size, 6 * len(chunk)))
+            columns = (6 * chunk[:, None] + np.arange(6)).ravel()
+            right[columns, np.arange(len(columns))] = 1.0
+            solution = self.factor.solve(right)
+            for k, block in enumerate(chunk):
+                out[start + k] = solution[6 * block : 6 * block + 6, 6 * k : 6 * k + 6]
+        return 0.5 * (out + np.swapaxes(out, 1, 2))
+
+    def log_determinant(self) -> float:
+        """Log determinant of the normal matrix."""
+        return float(np.sum(np.log(np.abs(self.factor.U.diagonal()))))
+
+
+def linearise(graph: gtsam.NonlinearFactorGraph, estimate: Estimate) -> Linearisation:
+    """Linearise at an estimate and factorise the normal matrix (SuperLU without pivoting: it is positive definite).
+
+    Raises:
+        GraphError: the system is indeterminate.
+    """
+    try:
+        rows, columns, entries = graph.linearize(to_values(estimate)).sparseJacobian_()
+    except RuntimeError as error:
+        raise _named(error) from None
+    size = 6 * (len(estimate.T_world_camera) + len(estimate.T_world_landmark))
+    jacobian = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))[:, :size]
+    normal = (jacobian.T @ jacobian).tocsc()
+    try:
+        factor = scipy.sparse.linalg.splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                                          options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise GraphError(f"the linearised graph is indeterminate: {error}") from None
+    return Linearisation(len(estimate.T_world_landmark), len(estimate.T_world_camera), jacobian, factor)

@@ -1,0 +1,257 @@
+"""State of the EM: what is fixed for a drive, and what an iteration changes. `init` builds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.geometry.pose import inverse, make_pose, se3_log, skew, transform
+from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.evidence import TrackletFeatures, log_population
+from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fit_prior, weighted_latents
+from nolbo_ppl.inference.slam.graph import (
+    Estimate,
+    Linearisation,
+    Links,
+    add_landmark_priors,
+    add_links,
+    add_observation_factors,
+    linearise,
+    odometry_factors,
+    optimise,
+    resolve_observations,
+)
+from nolbo_ppl.inference.slam.noise import TOO_SMALL, estimate_noise
+from nolbo_ppl.inference.slam.orientation import orientation_log_density, resolved_symmetry
+from nolbo_ppl.inference.slam.tracklets import Tracklets, build_tracklets
+
+REFINEMENTS = 3
+"""Iterations that refine odometry scales nobody stated."""
+
+
+@dataclass(frozen=True)
+class SlamState:
+    """Everything an iteration reads and returns."""
+
+    problem: SlamProblem
+    """Odometry and observations."""
+    config: SlamConfig
+    """Settings."""
+    noise: NoiseModel
+    """Scales in use."""
+    prior: FeaturePrior
+    """Population of features."""
+    tracklets: Tracklets
+    """Short-term tracks, numbered with moving ones."""
+    static: Int[np.ndarray, "m"]
+    """Tracks that are landmarks of the graph."""
+    rows: Int[np.ndarray, "k"]
+    """Detections in the graph."""
+    landmark: Int[np.ndarray, "k"]
+    """Landmark (index into `static`) of each of them."""
+    weight: Float[np.ndarray, "k"]
+    """Their weights: probability of being that object rather than background."""
+    features: TrackletFeatures
+    """Features of the landmarks."""
+    estimate: Estimate
+    """Poses and landmarks."""
+    links: Links
+    """Weighted links in use."""
+    typical_range: float
+    """Median range of detections, m."""
+    iteration: int = 0
+    """Iterations done."""
+    closing: bool = True
+    """Whether constellation rounds still run."""
+    graph_error: float = 0.0
+    """Half the sum of squared whitened residuals of the last M-step."""
+    closed: dict[int, int] = field(default_factory=dict)
+    """Tracklets closed by constellation, newer to older."""
+
+    @property
+    def link_scale(self) -> float:
+        """How much one object's measured position varies between passes, m: half the typical detection scale."""
+        return link_scale(self.noise)
+
+
+def link_scale(noise: NoiseModel) -> float:
+    """Half the median scale of a detected position, m."""
+    if not len(noise.position_covariance):
+        return 0.1
+    return 0.5 * float(np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3))
+
+
+def first_estimate(
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, rows: Int[np.ndarray, "k"], landmark: Int[np.ndarray, "k"],
+    landmarks: int,
+) -> Estimate:
+    """Landmarks at the weighted mean of their detections in the odometry frame, oriented as most of them agree."""
+    table = problem.observations
+    frame = table.frame[rows]
+    world = transform(problem.odometry[frame], table.position[rows])
+    w = 1.0 / np.maximum(np.trace(noise.position_covariance[rows], axis1=1, axis2=2), 1e-12)
+    total = np.bincount(landmark, weights=w, minlength=landmarks)
+    mean = np.stack([np.bincount(landmark, weights=w * world[:, i], minlength=landmarks) for i in range(3)], axis=1)
+    T = make_pose(np.tile(np.eye(3), (landmarks, 1, 1)), mean / np.maximum(total, 1e-300)[:, None])
+    symmetry = resolved_symmetry(table, config)[rows]
+    oriented = np.flatnonzero(table.has_rotation[rows])
+    R = problem.odometry[frame[oriented], :3, :3] @ table.rotation[rows[oriented]]
+    order = np.argsort(landmark[oriented], kind="stable")
+    groups, starts = np.unique(landmark[oriented][order], return_index=True)
+    for j, members in zip(groups, np.split(order, starts[1:])):
+        # The detection most of the others agree with, modes included: a mean would fall between flips.
+        members = members[np.linspace(0, len(members) - 1, min(len(members), 12)).astype(int)]
+        a, b = np.repeat(members, len(members)), np.tile(members, len(members))
+        value = orientation_log_density(R[a], R[b], np.maximum(noise.rotation_scale[rows[oriented[b]]], 0.05),
+                                        symmetry[oriented[b]], config)
+        T[j, :3, :3] = R[members[np.argmax(value.reshape(len(members), -1).sum(axis=1))]]
+    return Estimate(problem.odometry.copy(), T)
+
+
+def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
+    """Odometry, weighted observations and weak priors; the M-step adds its links."""
+    factors = resolve_observations(state.problem, state.noise, state.config, state.estimate, state.rows, state.landmark,
+                                   state.weight)
+    graph = odometry_factors(state.problem, state.noise)
+    add_observation_factors(graph, factors)
+    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
+    return graph
+
+
+def inlier_weights(state: SlamState) -> Float[np.ndarray, "k"]:
+    """Probability of each detection in the graph being its object rather than background, given the estimate.
+
+    Odds are objectness times the density of the position about the prediction, against the clutter density. This is how
+    gross errors leave the graph: by evidence, with weights frozen through the next M-step.
+    """
+    table, rows = state.problem.observations, state.rows
+    frame = table.frame[rows]
+    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
+    error = predicted - table.position[rows]
+    S = state.noise.position_covariance[rows]
+    square = np.einsum("ki,ki->k", error, np.linalg.solve(S, error[..., None])[..., 0]) if len(rows) else np.zeros(0)
+    objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
+    log_object = np.log(objectness) - 0.5 * (square + np.linalg.slogdet(2 * np.pi * S)[1])
+    log_background = np.log1p(-objectness) + np.log(state.noise.clutter_rate)
+    return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
+
+
+def tracklet_features(
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior, rows: Int[np.ndarray, "k"],
+    landmark: Int[np.ndarray, "k"], weight: Float[np.ndarray, "k"], landmarks: int,
+) -> TrackletFeatures:
+    """Latent posterior, category, symmetry and life span of each landmark from its detections."""
+    table = problem.observations
+    latent, variance, category = detection_features(table, noise, prior)
+    mean, spread = weighted_latents(latent[rows], variance[rows], landmark, weight, landmarks)
+    votes = np.zeros((landmarks, len(prior.categories) + 1))
+    named = category[rows] >= 0
+    np.add.at(votes, (landmark[named], category[rows][named]), weight[named])
+    best = np.where(votes.sum(axis=1) > 0, np.argmax(votes, axis=1), -1)
+    symmetry = np.ones(landmarks, dtype=np.int64)
+    symmetry[landmark] = resolved_symmetry(table, config)[rows]
+    oriented = np.zeros(landmarks, dtype=bool)
+    oriented[landmark[table.has_rotation[rows]]] = True
+    first, last = np.full(landmarks, len(problem)), np.full(landmarks, -1)
+    np.minimum.at(first, landmark, table.frame[rows])
+    np.maximum.at(last, landmark, table.frame[rows])
+    return TrackletFeatures(mean, spread, log_population(mean, spread), best, symmetry, oriented, first, last)
+
+
+def linearise_state(state: SlamState) -> Linearisation:
+    """Linearise the graph with its links at the estimate, each link by its robust weight there."""
+
+
+    graph = base_graph(state)
+    add_links(graph, state.links, state.config.robust_width)
+    return linearise(graph, state.estimate)
+
+
+def refine_odometry(state: SlamState, linearisation: Linearisation, *, only_warn: bool = False) -> SlamState:
+    """One EM update of the odometry scales: the mean square residual of a step over the posterior, `E[r^2]`.
+
+    The expectation is over samples of the linearised graph: `r = r0 + d_i+1 - Ad d_i`. Stated scales are left as they
+    are unless found too small (and `correct_scales`); either is reported.
+    """
+    config, noise = state.config, state.noise
+    n = len(state.problem)
+    if n < 3 or not len(state.rows):
+        return state
+    rng = np.random.default_rng(config.seed + 7919)
+    delta, _ = linearisation.samples(min(config.samples, 32), rng)
+    T = state.estimate.T_world_camera
+    step = inverse(T[:-1]) @ T[1:]
+    measured = inverse(state.problem.odometry[:-1]) @ state.problem.odometry[1:]
+    mean = se3_log(inverse(measured) @ step)
+    back = inverse(step)
+    R, t = back[:, :3, :3], back[:, :3, 3]
+    adjoint = np.zeros((n - 1, 6, 6))
+    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
+    adjoint[:, 3:, :3] = skew(t) @ R
+    change = delta[1:] - adjoint @ delta[:-1]
+    square = mean**2 + np.mean(change**2, axis=2)
+    rotation = float(np.sqrt(np.mean(square[:, :3] / noise.rotation_step[:, None] ** 2)))
+    translation = float(np.sqrt(np.mean(square[:, 3:] / noise.translation_step[:, None] ** 2)))
+    report, warnings = dict(noise.report), list(noise.warnings)
+    stated_rotation = config.odometry_rotation_scale is not None
+    stated_translation = (config.odometry_translation_scale, config.odometry_translation_ratio) != (None, None)
+    factors = []
+    for name, stated, ratio in (("rotation", stated_rotation, rotation), ("translation", stated_translation, translation)):
+        if not stated and not only_warn:
+            factors.append(ratio)
+        elif stated and ratio > TOO_SMALL:
+            text = f"stated odometry {name} scale is too small: residuals are {ratio:.2f} times as wide"
+            warnings = [w for w in warnings if not w.startswith(f"stated odometry {name}")] + [text]
+            factors.append(ratio if config.correct_scales else 1.0)
+        else:
+            factors.append(1.0)
+    noise = replace(noise, rotation_step=noise.rotation_step * factors[0], translation_step=noise.translation_step * factors[1],
+                    report=report, warnings=tuple(warnings))
+    report["odometry_rotation_scale"] = float(np.median(noise.rotation_step))
+    report["odometry_translation_scale"] = float(np.median(noise.translation_step))
+    return replace(state, noise=noise)
+
+
+def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
+    """Scales, tracklets, and the graph of odometry and tracklets solved once; no loop is closed yet.
+
+    Raises:
+        InputError: the problem is malformed (see `SlamProblem`).
+        GraphError: GTSAM could not solve the graph.
+    """
+    noise = estimate_noise(problem, config)
+    prior = fit_prior(problem.observations, config)
+    tracklets = build_tracklets(problem, noise, config, prior)
+    return init_from_tracklets(problem, config, noise, prior, tracklets)
+
+
+def init_from_tracklets(
+    problem: SlamProblem, config: SlamConfig, noise: NoiseModel, prior: FeaturePrior, tracklets: Tracklets
+) -> SlamState:
+    """The second half of `init`, for tracklets that came from elsewhere (the online tracker)."""
+    static = np.flatnonzero(~tracklets.moving)
+    number = np.full(len(tracklets) + 1, -1)
+    number[static] = np.arange(len(static))
+    landmark = number[tracklets.of_observation]
+    rows = np.flatnonzero(landmark >= 0)
+    landmark, weight = landmark[rows], tracklets.weight[rows]
+    distance = np.linalg.norm(problem.observations.position, axis=1)
+    state = SlamState(
+        problem=problem, config=config, noise=noise, prior=prior, tracklets=tracklets, static=static, rows=rows,
+        landmark=landmark, weight=weight,
+        features=tracklet_features(problem, noise, config, prior, rows, landmark, weight, len(static)),
+        estimate=first_estimate(problem, noise, config, rows, landmark, len(static)), links=Links.none(),
+        typical_range=float(np.median(distance)) if len(distance) else 1.0,
+    )
+    unstated = config.odometry_rotation_scale is None or (
+        config.odometry_translation_scale is None and config.odometry_translation_ratio is None)
+    for repeat in range(1 + (REFINEMENTS if unstated else 1)):
+        estimate, _, error = optimise(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
+        state = replace(state, estimate=estimate, graph_error=error)
+        state = replace(state, weight=inlier_weights(state))
+        state = refine_odometry(state, linearise_state(state))
+    estimate, _, error = optimise(base_graph(state), state.estimate, iterations=4)
+    return replace(state, estimate=estimate, graph_error=error)
