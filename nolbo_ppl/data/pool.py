@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import UInt8
@@ -19,7 +20,11 @@ INSTANCES = 2000
 SEED_STRIDE = 100_000
 """Instance k of the data set with seed s is `shape_from_seed(category, s * SEED_STRIDE + k)`: no two seeds share one."""
 KEPT = 1024
-"""Shapes with their ray-casting structures held in memory."""
+"""Shapes with their ray-casting structures held in memory: more than one block of scenes draws from."""
+BLOCK = 1024
+"""Scenes that share a window of instances, so that a shape made once is used about five times."""
+WINDOW = 60
+"""Instances a category in the window of a block; the windows of successive blocks follow each other."""
 VOXELS = 32
 """Resolution of the stored occupancy grids."""
 
@@ -30,6 +35,13 @@ class Item:
 
     shape: Shape
     mesh: Mesh
+    number: int
+    """Number of the instance in its pool, over all categories."""
+
+    @cached_property
+    def voxels(self) -> UInt8[np.ndarray, " bytes"]:
+        """Occupancy at 32^3, packed to bits in C order."""
+        return packed_voxels(self.shape)
 
 
 class ShapePool:
@@ -60,6 +72,9 @@ class ShapePool:
                     "no CAD shape of the wanted categories", got=sorted({s.category for s in cad}), expected=categories
                 )
         self.categories: tuple[str, ...] = tuple(categories) if self.cad is None else tuple(self.cad)
+        counts = [self.count(category) for category in self.categories]
+        self._first = dict(zip(self.categories, np.cumsum([0, *counts[:-1]]).tolist()))
+        self.total: int = sum(counts)
         self._kept: OrderedDict[tuple[str, int], Item] = OrderedDict()
 
     def __getstate__(self) -> dict:
@@ -77,22 +92,31 @@ class ShapePool:
                 shape = shape_from_seed(category, self.seed * SEED_STRIDE + number)
             else:
                 shape = self.cad[category][number]
-            self._kept[key] = Item(shape, Mesh(shape.vertices, shape.faces, shape.part))
+            mesh = Mesh(shape.vertices, shape.faces, shape.part)
+            self._kept[key] = Item(shape, mesh, self._first[category] + number)
             if len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
         else:
             self._kept.move_to_end(key)
         return self._kept[key]
 
-    def draw(self, rng: np.random.Generator) -> Item:
-        """A random instance of a random category, all categories equally likely."""
+    def draw(self, rng: np.random.Generator, block: int) -> Item:
+        """A random instance, within the window of a block, of a random category; all categories equally likely."""
         category = self.categories[int(rng.integers(len(self.categories)))]
-        return self.item(category, int(rng.integers(self.count(category))))
+        count = self.count(category)
+        within = int(rng.integers(min(WINDOW, count)))
+        return self.item(category, (block * WINDOW + within) % count)
+
+    def item_of(self, number: int) -> Item:
+        """The instance of that number over all categories."""
+        category = next(name for name in reversed(self.categories) if self._first[name] <= number)
+        return self.item(category, number - self._first[category])
 
     def describe(self) -> dict[str, object]:
         """What identifies the pool: the key of a cache depends on it."""
         if self.cad is None:
-            return {"seed": self.seed, "instances": self.instances, "categories": list(self.categories)}
+            windows = {"block": BLOCK, "window": WINDOW}
+            return {"seed": self.seed, "instances": self.instances, "categories": list(self.categories), **windows}
         return {"cad": {name: [shape.instance for shape in shapes] for name, shapes in self.cad.items()}}
 
 

@@ -8,10 +8,10 @@ object without the others, which its visibility needs, comes for free.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
@@ -46,11 +46,6 @@ class Mesh:
         normal = np.cross(b - a, c - a)
         return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
 
-    @cached_property
-    def radius(self) -> float:
-        """Radius of the ball about the mesh's origin that holds it."""
-        return float(np.linalg.norm(self.vertices, axis=1).max())
-
 
 @dataclass(frozen=True)
 class Placed:
@@ -78,8 +73,9 @@ class Placed:
 
     @cached_property
     def radius(self) -> float:
-        """Radius of a ball about `offset` that holds the mesh, in the camera frame."""
-        return self.mesh.radius * float(np.linalg.norm(self.linear, ord=2))
+        """Radius of the ball about `offset` that holds the mesh, in the camera frame."""
+        difference = self.vertices - self.offset
+        return float(np.sqrt(np.einsum("vd,vd->v", difference, difference).max()))
 
 
 @dataclass(frozen=True)
@@ -186,7 +182,9 @@ def _first_hits(placed: Placed, directions: np.ndarray) -> tuple[np.ndarray, np.
     """Face (or -1) and depth of the first hit of rays from the camera with z = 1."""
     origin = (-(placed.inverse @ placed.offset)).astype(np.float32)
     local = directions @ placed.inverse.T.astype(np.float32)
-    hit = placed.mesh.scene.run(np.broadcast_to(origin, local.shape).copy(), local, output=1)
+    origins = np.empty_like(local)
+    origins[:] = origin
+    hit = placed.mesh.scene.run(origins, local, output=1)
     return hit["primID"], np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
 
 
@@ -244,23 +242,37 @@ def trace(view: View) -> Hits:
     )  # fmt: skip
 
 
+@numba.njit(cache=True)
+def _behind_ball(points: np.ndarray, dark: np.ndarray, centre: np.ndarray, radius: float, light: np.ndarray):
+    """Numbers of the points, not dark yet, whose ray to the light may meet a ball, and their offsets from its centre."""
+    chosen = np.empty(len(points), dtype=np.int64)
+    offset = np.empty((len(points), 3), dtype=np.float32)
+    count = 0
+    for i in range(len(points)):
+        if dark[i]:
+            continue
+        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        along = -(x * light[0] + y * light[1] + z * light[2])
+        if along > -radius and x * x + y * y + z * z - along * along < radius * radius:
+            chosen[count] = i
+            offset[count, 0], offset[count, 1], offset[count, 2] = x, y, z
+            count += 1
+    return chosen[:count], offset[:count]
+
+
 def shadowed(
     view: View, points: Float[np.ndarray, "n 3"], light: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " n"]:
     """Which points (camera frame, already lifted off their surface) a mesh hides from the light in that direction."""
     dark = np.zeros(len(points), dtype=bool)
-    (light,) = _f32(light)
+    points, light = _f32(points, light)
     for placed in view.placed:
-        to_centre = placed.offset.astype(np.float32) - points
-        along = to_centre @ light
-        across = np.einsum("nd,nd->n", to_centre, to_centre) - along * along
-        near = np.flatnonzero((across < placed.radius**2) & (along > -placed.radius) & ~dark)
-        if not len(near):
-            continue
-        inverse = placed.inverse.astype(np.float32)
-        origins = -to_centre[near] @ inverse.T
-        rays = np.broadcast_to(inverse @ light, origins.shape).copy()
-        dark[near] = placed.mesh.scene.run(np.ascontiguousarray(origins), rays, query="OCCLUDED") >= 0
+        centre, inverse = _f32(placed.offset, placed.inverse)
+        near, offset = _behind_ball(points, dark, centre, np.float32(placed.radius), light)
+        if len(near):
+            rays = np.empty_like(offset)
+            rays[:] = inverse @ light
+            dark[near] = placed.mesh.scene.run(offset @ inverse.T, rays, query="OCCLUDED") >= 0
     return dark
 
 
@@ -455,10 +467,19 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
     return colour.reshape(view.height, view.width, 3)
 
 
-def to_display(colour: Float[np.ndarray, "height width 3"], exposure: float = 1.0) -> UInt8[np.ndarray, "height width 3"]:
-    """Eight-bit display values of linear light: exposure, clipping and gamma 2.2, without rounding bias."""
-    display = np.clip(colour * exposure, 0.0, 1.0) ** np.float32(1 / 2.2)
-    return (display * 255 + 0.5).astype(np.uint8)
+GAMMA = np.linspace(0.0, 1.0, 8192, dtype=np.float32) ** np.float32(1 / 2.2)
+"""Display value of linear light in [0, 1], tabulated: a power for every channel of every pixel costs 2 ms an image."""
+
+
+def to_display(
+    colour: Float[np.ndarray, "height width 3"], exposure: float, noise: Float[np.ndarray, "height width 3"] | None = None
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Eight-bit display values of linear light: exposure, clipping, gamma 2.2, noise (over full range), rounding."""
+    scaled = np.clip(colour * np.float32(exposure * (len(GAMMA) - 1)), 0, len(GAMMA) - 1)
+    display = GAMMA[(scaled + np.float32(0.5)).astype(np.int32)]
+    if noise is not None:
+        display = np.clip(display + noise, 0, 1)
+    return (display * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
 def average_down(colour: Float[np.ndarray, "height width 3"], factor: int) -> Float[np.ndarray, "h w 3"]:
@@ -466,8 +487,3 @@ def average_down(colour: Float[np.ndarray, "height width 3"], factor: int) -> Fl
     height, width, channels = colour.shape
     blocks = colour.reshape(height // factor, factor, width // factor, factor, channels)
     return blocks.mean(axis=(1, 3))
-
-
-def placed_all(groups: Sequence[Sequence[Placed]]) -> tuple[Placed, ...]:
-    """Concatenate groups of placed meshes."""
-    return tuple(placed for group in groups for placed in group)

@@ -18,10 +18,9 @@ from nolbo_ppl.data import clutter
 from nolbo_ppl.data.backdrop import sample_backdrop, sample_light
 from nolbo_ppl.data.materials import Material, sample_material, sample_materials
 from nolbo_ppl.data.pictures import Photographs
-from nolbo_ppl.data.pool import ShapePool
+from nolbo_ppl.data.pool import BLOCK, Item, ShapePool
 from nolbo_ppl.data.render import Hits, Mesh, Placed, View, average_down, shade, to_display, trace
 from nolbo_ppl.data.scene_config import SceneConfig
-from nolbo_ppl.data.shapes import Shape
 
 CAMERA_HEIGHT = 1.0
 """The scene's unit of length."""
@@ -37,12 +36,13 @@ R_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 class SceneObject:
     """One labelled object of a scene, in the scene's units."""
 
-    shape: Shape
     R_camera_object: Float[np.ndarray, "3 3"]
     centre: Float[np.ndarray, "3"]
     """Box centre in the camera frame, scene units."""
     diagonal: float
     """Box diagonal, scene units."""
+    item: Item
+    """What it was drawn from."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,8 @@ class ObjectLabel:
     visibility: float
     """Pixels seen over pixels of the silhouette without anything before it, its part beyond the border included."""
     symmetry: int
+    item: Item
+    """The shape, with the number of the instance in its pool."""
 
 
 @dataclass(frozen=True)
@@ -198,10 +200,10 @@ class _Composer:
 
 
 def _object(
-    composer: _Composer, pool: ShapePool, owner: int, config: SceneConfig, rng: np.random.Generator
+    composer: _Composer, pool: ShapePool, block: int, owner: int, config: SceneConfig, rng: np.random.Generator
 ) -> tuple[SceneObject, Placed] | None:
     """Draw one labelled object and its place."""
-    item = pool.draw(rng)
+    item = pool.draw(rng, block)
     shape = item.shape
     materials: tuple[Material, ...] = sample_materials(shape.parts, rng)
     R_world_object = _vertical(rng.uniform(-np.pi, np.pi))
@@ -220,7 +222,7 @@ def _object(
     centre, diagonal = place
     R_camera_object = composer.R_camera_world @ R_world_object
     placed = Placed(item.mesh, R_camera_object * diagonal, centre, materials, owner, texture_seed)
-    return SceneObject(shape, R_camera_object, centre, diagonal), placed
+    return SceneObject(R_camera_object, centre, diagonal, item), placed
 
 
 def _pixel_range(pixels: tuple[float, float], size: int) -> tuple[float, float]:
@@ -259,16 +261,28 @@ def _clutter(composer: _Composer, config: SceneConfig, rng: np.random.Generator)
 
 
 def sample_scene(
-    config: SceneConfig, rng: np.random.Generator, pool: ShapePool, photographs: Photographs | None = None
+    config: SceneConfig,
+    rng: np.random.Generator,
+    pool: ShapePool,
+    photographs: Photographs | None = None,
+    block: int = 0,
 ) -> Scene:
-    """Draw a scene. Everything random comes from `rng`; objects that find no room are left out."""
+    """Draw a scene. Everything random comes from `rng`; objects that find no room are left out.
+
+    Args:
+        config: what scenes look like.
+        rng: source of every random number.
+        pool: the shapes.
+        photographs: pictures for the background, if any.
+        block: which window of the pool's instances to draw from.
+    """
     composer = _Composer(config, rng)
     objects: list[SceneObject] = []
     placed: list[Placed] = []
     empty = rng.random() < config.empty_probability
     wanted = 0 if empty else int(rng.integers(config.objects[0], config.objects[1] + 1))
     for _ in range(wanted):
-        found = _object(composer, pool, len(objects), config, rng)
+        found = _object(composer, pool, block, len(objects), config, rng)
         if found is not None:
             objects.append(found[0])
             placed.append(found[1])
@@ -293,7 +307,7 @@ def scene_at(
     config: SceneConfig, seed: int, index: int, pool: ShapePool, photographs: Photographs | None = None
 ) -> Scene:
     """Scene `index` of seed `seed`: depends on nothing else, however many processes share the work."""
-    return sample_scene(config, np.random.default_rng([seed, index]), pool, photographs)
+    return sample_scene(config, np.random.default_rng([seed, index]), pool, photographs, index // BLOCK)
 
 
 def amodal_box(placed: Placed, view: View) -> Float[np.ndarray, "4"]:
@@ -361,12 +375,8 @@ def render_scene(scene: Scene) -> Rendered:
     factor = scene.supersample
     view, hits, visibility = _seen_objects(scene, _fine(scene.view, factor))
     colour = _blurred(average_down(shade(view, hits), factor), scene.blur)
-    if scene.noise > 0:
-        noise = np.random.default_rng(scene.noise_seed).standard_normal(colour.shape, dtype=np.float32)
-        display = np.clip(colour * scene.exposure, 0, 1) ** np.float32(1 / 2.2) + scene.noise * noise
-        image = (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8)
-    else:
-        image = to_display(colour, scene.exposure)
+    noise = np.random.default_rng(scene.noise_seed).standard_normal(colour.shape, dtype=np.float32)
+    image = to_display(colour, scene.exposure, np.float32(scene.noise) * noise)
     labels = []
     number = np.full(len(view.placed) + 1, -1)
     for k, placed in enumerate(view.placed):
@@ -379,9 +389,9 @@ def render_scene(scene: Scene) -> Rendered:
 
 
 def _label(thing: SceneObject, box: np.ndarray, visibility: float) -> ObjectLabel:
-    shape = thing.shape
+    shape = thing.item.shape
     return ObjectLabel(
         category=shape.category, instance=shape.instance, box=box, R_camera_object=thing.R_camera_object,
         position=thing.centre * (shape.diagonal / thing.diagonal), size=shape.diagonal, dimensions=shape.dimensions,
-        visibility=min(1.0, visibility), symmetry=shape.symmetry,
+        visibility=min(1.0, visibility), symmetry=shape.symmetry, item=thing.item,
     )  # fmt: skip
