@@ -36,7 +36,7 @@ def _axles(b: Builder, d: Draw, half: float, ys: tuple[float, ...], radius: floa
     rim = d(0.5, 0.65)
     for y in ys:
         for sign in (-1.0, 1.0):
-            b.wheel(sign * (half + PROUD), y, radius, 0.35, rim=rim)
+            b.wheel(sign * (half + 1.7 * PROUD), y, radius, 0.35, rim=rim)
 
 
 def _tail(b: Builder, d: Draw, rear: float, half: float, floor: float, height: float, window: bool) -> None:
@@ -46,7 +46,7 @@ def _tail(b: Builder, d: Draw, rear: float, half: float, floor: float, height: f
     red_h = d(0.35, 0.8)
     b.pair("light_rear", (half - 0.34, half - 0.06), (rear - 0.2, rear + 2 * PROUD), (floor + 0.6, floor + 0.6 + red_h))
     b.pair("light_rear", (half - 0.4, half - 0.06), (rear - 0.2, rear + PROUD), (height - 0.22, height - 0.1), decal=True)
-    b.box("trim", (-half - 0.01, half + 0.01), (rear - 0.3, rear + 0.1), (floor, floor + 0.3))
+    b.box("trim", (-half - 0.01, half + 0.01), (rear - 0.3, rear + 0.1), (floor - 0.04, floor + 0.3))
     if window:
         top = height - 0.3
         b.box("glass", (-half * 0.6, half * 0.6), (rear - 0.2, rear + PROUD), (top - d(0.35, 0.6), top), decal=True)
@@ -54,7 +54,7 @@ def _tail(b: Builder, d: Draw, rear: float, half: float, floor: float, height: f
 
 def _face(b: Builder, d: Draw, front: float, half: float, floor: float, sill: float) -> None:
     """Add the lower front: bumper, white lamps, grille, plate."""
-    b.box("trim", (-half - 0.02, half + 0.02), (front - 0.12, front + 0.4), (floor, floor + d(0.25, 0.4)))
+    b.box("trim", (-half - 0.02, half + 0.02), (front - 0.12, front + 0.4), (floor - 0.04, floor + d(0.25, 0.4)))
     lamp_h, lamp_w = d(0.2, 0.34), d(0.35, 0.6)
     top = min(sill - 0.08, floor + 0.42 + lamp_h)
     b.pair("light_front", (half - lamp_w - 0.05, half - 0.05), (front - PROUD, front + 0.2), (top - lamp_h, top))
@@ -97,7 +97,7 @@ def _box_bus(b: Builder, d: Draw, style: str) -> None:
     panes = d.integer(4, 7) if style != "mini" else d.integer(2, 4)
     _row(b, d, half, (door + 0.1, engine), (belt, top), panes)
     if style == "double":
-        _row(b, d, half, (front + rake + 0.4, rear - 0.5), (2.8, height - 0.4), panes + 1)
+        _row(b, d, half, (front + rake + 0.4, engine), (2.8, height - 0.4), panes + 1)
     # The driver's window steps down towards the windscreen; the door is on the other side.
     drive = [(front + rake * 0.4 + 0.25, sill - 0.25), (front + rake + 0.15, top), (door, top), (door, sill - 0.25)]
     b.extrude(0, "glass", drive, half - 0.1, half + PROUD, decal=True)
@@ -106,9 +106,9 @@ def _box_bus(b: Builder, d: Draw, style: str) -> None:
     if style in ("city", "double") and d.chance(0.7):
         y = d(-0.05, 0.15) * length
         b.box("trim", (-half - 1.5 * PROUD, -half + 0.1), (y, y + 1.2), (floor + 0.1, top - 0.1), decal=True)
-    b.pair("body2", (half - 0.2, half + 0.5 * PROUD), (engine + 0.1, rear - 0.02), (floor + 0.1, height - 0.3), decal=True)
+    b.pair("body2", (half - 0.2, half + 0.8 * PROUD), (engine + 0.1, rear - 0.08), (floor + 0.1, height - 0.3), decal=True)
     if d.chance(0.6):
-        b.pair("body2", (half - 0.2, half + 0.5 * PROUD), (door, engine), (floor + 0.1, floor + d(0.3, 0.6)), decal=True)
+        b.pair("body2", (half - 0.2, half + 0.8 * PROUD), (door, engine), (floor + 0.1, floor + d(0.3, 0.6)), decal=True)
     b.tubes("trim", [(half - 0.02, front + 0.3 * rake, top - 0.05), (half + 0.14, front - 0.35, top - 0.1),
                      (half + 0.14, front - 0.38, top - 0.55)], [0.04, 0.05, 0.11], segments=5)
     if d.chance(0.7):
@@ -138,7 +138,7 @@ def _school(b: Builder, d: Draw) -> None:
     b.box("grille", (-hood_half * 0.6, hood_half * 0.6), (front - PROUD, front + 0.1), (floor + 0.25, hood - 0.2))
     b.pair("light_front", (hood_half * 0.64, hood_half * 0.98), (front - PROUD, front + 0.1), (hood - 0.52, hood - 0.2))
     b.box("trim", (-half, half), (front - 0.15, front + 0.2), (floor - 0.05, floor + 0.22))
-    b.pair("trim", (half * 0.5, half * 0.98), (front + 0.45, cowl), (floor, floor + 0.5))
+    b.pair("trim", (half * 0.5, half * 0.98), (front + 0.45, cowl), (floor - 0.04, floor + 0.5))
     b.box("display", (-half * 0.6, half * 0.6), (cowl + 0.2, cowl + 0.5), (top + 0.06, height - 0.02), decal=True)
     blind = rear - d(0.5, 1.2)
     _row(b, d, half, (cowl + 1.2, blind), (sill + 0.1, top), d.integer(5, 9))

@@ -224,7 +224,7 @@ def _bike_body(
         width = d(0.2, 0.26) if style == "sport" else d(0.26, 0.34)
         slope = 0.35
         flare = (width + slope * nose * -0.6, slope * 0.6, 0.0)
-        b.side(("body", "windscreen", "body", "body", "body", "body"),
+        b.side(("body", "windscreen", "trim", "trim", "body", "body"),
                [(nose, top - 0.16), (nose + 0.1, top), (head[1] + 0.08, top + d(0.12, 0.26)), (head[1] + 0.14, top - 0.12),
                 (head[1] + 0.1, head[2] - 0.34), (nose + 0.14, head[2] - 0.3)], (flare[0] * 0.75, flare[1] * 0.5, 0.0))
         b.pair("light_front", (0.04, 0.15), (nose - 0.025, nose + 0.08), (top - 0.23, top - 0.13))

@@ -65,19 +65,21 @@ def tvmonitor(b: Builder, d: Draw) -> int:
     z0, z1 = foot_h, foot_h + 2 * h + chin
     bezel = d(0.008, 0.02) if style == "flat" else d(0.01, 0.028)
     case = "trim" if style != "allinone" else "metal"
-    b.box(case, (-w, w), (-0.5 * thick, 0.5 * thick), (z0, z1))
+    back = "body2" if d.chance(0.3) else "plastic"
+    b.box(case, (-w, w), (-0.5 * thick, 0.1 * thick), (z0, z1))
+    b.box(back, (-0.985 * w, 0.985 * w), (0.0, 0.5 * thick), (z0 + 0.015 * w, z1 - 0.015 * w))
     proud = 0.005 * 2.2 * w
     b.box("screen", (-w + bezel, w - bezel), (-0.5 * thick - proud, 0), (z0 + bezel + chin, z1 - bezel), decal=True)
     # Behind: a housing that tapers away, with vents and a field of sockets.
     deep = d(0.03, 0.07) if style == "flat" else d(0.03, 0.08)
     a, c = d(0.45, 0.8), d(0.3, 0.7)
     mid = z0 + d(0.35, 0.5) * (z1 - z0)
-    b.loft(1, "plastic", (0.4 * thick, 0.5 * thick + deep), [(0, mid), (0, mid)], [(w * (a + 0.12), h * (c + 0.12)), (w * a, h * c)],
+    b.loft(1, "trim" if d.chance(0.4) else back, (0.4 * thick, 0.5 * thick + deep), [(0, mid), (0, mid)], [(w * (a + 0.12), h * (c + 0.12)), (w * a, h * c)],
            section=((-1, -1), (1, -1), (1, 1), (-1, 1)))
     y = 0.5 * thick + deep
     for i in range(4):
-        z = mid + h * c * (0.15 + 0.2 * i)
-        b.box("grille", (-w * a * 0.75, w * a * 0.75), (y - 0.01, y + proud), (z, z + 0.07 * h), decal=True)
+        z = mid + h * c * (0.1 + 0.2 * i)
+        b.box("grille", (-w * a * 0.75, w * a * 0.75), (y - 0.01, y + proud), (z, z + 0.11 * h * c), decal=True)
     b.box("label", (-w * a * 0.5, w * a * 0.1), (y - 0.01, y + proud), (mid - 0.6 * h * c, mid - 0.25 * h * c), decal=True)
     b.box("light_front", (w * 0.82, w * 0.87), (-0.5 * thick - proud, 0), (z0 + 0.3 * bezel + 0.2 * chin, z0 + 0.7 * bezel + 0.4 * chin), decal=True)
     reach = d(0.1, 0.16) if style == "flat" else d(0.08, 0.13)
@@ -121,6 +123,6 @@ def _crt(b: Builder, d: Draw) -> None:
     for i in range(4):
         zz = zc + shrink * h * (-0.5 + 0.32 * i)
         b.box("grille", (-0.7 * shrink * w, 0.7 * shrink * w), (ye - 0.02, ye + proud), (zz, zz + 0.12 * shrink * h), decal=True)
-    b.pair("trim", (0.5 * w, 0.9 * w), (y0 + 0.01, ye - 0.1 * deep), (0, 0.1 * h))
+    b.pair("trim", (0.5 * w, 0.9 * w), (y0 + 0.01, ye - 0.1 * deep), (-0.006, 0.1 * h))
     if d.chance(0.25):
         b.tubes("metal", [(0.02, ym, 1.7 * h), (w * d(0.4, 0.9), ym, 2 * h + d(0.2, 0.4))], 0.006, segments=4)

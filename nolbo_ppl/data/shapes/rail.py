@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from nolbo_ppl.data.shapes.builder import Builder, Draw
 
-PROUD = 0.07
+PROUD = 0.1
 """How far lights and windows stand off the body (0.004 to 0.006 of the diagonal)."""
 
 
@@ -125,7 +125,7 @@ def _unit(b: Builder, d: Draw, style: str) -> None:
         b.tube("body2", [(0, y0, sill), (0, mid, top)], 0.1, segments=5)
     panel = d(0.9, 2.2)
     b.extrude(0, "body2", [(y0 + 0.1, floor + 0.1), (y0 + 0.1, sill), (mid + 0.25, top - 0.05), (mid + panel, top - 0.05), (mid + panel * d(0.7, 1.3), floor + 0.1)],
-              -half - 0.5 * PROUD, half + 0.5 * PROUD, decal=True)
+              -half - 0.8 * PROUD, half + 0.8 * PROUD, decal=True)
     b.pair("glass", (half - 0.1, half + 1.5 * PROUD), (mid + 0.35, mid + 1.0), (sill + 0.1, top - 0.15), decal=True)
     lamp = d(0.2, 0.34)
     b.pair("light_front", (half - 0.25 - 2 * lamp, half - 0.2), (y0 - PROUD, y0 + 0.3), (sill - 0.2 - lamp, sill - 0.15))

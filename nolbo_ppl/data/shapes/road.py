@@ -26,13 +26,13 @@ def _lamps(b: Builder, d: Draw, front: float, rear: float, half: float, z: float
     grille_h = d(0.14, max(0.16, 0.45 * (z - ground)))
     grille_w = min(half - lamp_w - 0.08, d(0.3, 0.6))
     b.box("grille", (-grille_w, grille_w), (front - PROUD, front + 0.1), (top - grille_h, top - 0.01))
-    b.box("trim", (-half - 0.02, half + 0.02), (front - 0.07, front + 0.25), (ground, ground + d(0.12, 0.25)))
+    b.box("trim", (-half - 0.02, half + 0.02), (front - 0.07, front + 0.25), (ground - 0.03, ground + d(0.12, 0.25)))
     b.box("plate", (-0.26, 0.26), (front - 0.105, front), (ground + 0.05, ground + 0.16), decal=True)
     tall = d.chance(0.4)
     red_w, red_h = (d(0.12, 0.2), d(0.3, 0.5)) if tall else (d(0.28, 0.5), d(0.13, 0.2))
     top = rear_z - 0.04
     b.pair("light_rear", (half - red_w - 0.01, half - 0.01), (rear - 0.1, rear + PROUD), (top - red_h, top))
-    b.box("trim", (-half - 0.02, half + 0.02), (rear - 0.25, rear + 0.06), (ground, ground + d(0.12, 0.3)))
+    b.box("trim", (-half - 0.02, half + 0.02), (rear - 0.25, rear + 0.06), (ground - 0.03, ground + d(0.12, 0.3)))
     b.box("plate", (-0.26, 0.26), (rear - 0.1, rear + PROUD), (top - 0.26, top - 0.14), decal=True)
 
 
@@ -41,7 +41,7 @@ def _wheels(b: Builder, d: Draw, front: float, rear: float, half: float, radius:
     width, rim = d(0.2, 0.28), d(0.55, 0.75)
     for y in (front, rear):
         for sign in (-1.0, 1.0):
-            b.wheel(sign * (half + 0.03), y, radius, width, rim=rim)
+            b.wheel(sign * (half + 0.06), y, radius, width, rim=rim)
 
 
 def _mirrors(b: Builder, y: float, z: float, half: float) -> None:

@@ -37,7 +37,7 @@ def _hull(
     stations = [(y, half * w, z) for y, w, z in zip(ys, plan, deck)]
     if band:
         high = 0.05 * depth + 0.02
-        b.loft(1, "body2", ys, [(0.0, z - high) for z in deck], [(w + 0.006 * length, high) for _, w, _ in stations],
+        b.loft(1, "body2", [ys[0] - 0.006 * length, *ys[1:-1], ys[-1] + 0.006 * length], [(0.0, z - high - 0.006 * length) for z in deck], [(w + 0.008 * length, high) for _, w, _ in stations],
                section=((-1, -1), (1, -1), (1, 1), (-1, 1)), decal=True)
     return stations
 
