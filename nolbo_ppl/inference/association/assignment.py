@@ -1,9 +1,10 @@
 """The best joint association and its dual potentials, by successive shortest augmenting paths.
 
-The potentials u (detections) and v (landmarks, v >= 0) satisfy `u_i + v_j >= log_likelihood_ij` and `u_i >= log_null_i`
-with equality along the best association, so the *reduced* weights `exp(log_likelihood_ij - u_i - v_j)`,
-`exp(log_null_i - u_i)` and, for an unused landmark, `exp(-v_j)` are at most 1 and all 1 along it: sums over associations
-of products of reduced weights neither overflow nor underflow, whatever the spread of the logs.
+The potentials u (detections) and v (landmarks, v >= 0) satisfy `u_i + v_j >= log_likelihood_ij` and
+`u_i >= log_null_i` with equality along the best association, so the *reduced* weights
+`exp(log_likelihood_ij - u_i - v_j)`, `exp(log_null_i - u_i)` and, for an unused landmark, `exp(-v_j)` are at most 1
+and all 1 along it: sums over associations of products of reduced weights neither overflow nor underflow, whatever the
+spread of the logs.
 
 scipy's `linear_sum_assignment` gives no potentials (they would need Bellman sweeps) and costs one Python call a frame;
 the path search below yields both, for a whole sequence in one compiled call.

@@ -39,9 +39,9 @@ def k_best_associations(
         found.append(Association(match, -negative))
         if len(found) < k:
             for part, agreeing in _partition(region, match, fixed):
-                candidate, failed = try_assign(part)
+                other, failed = try_assign(part)
                 if failed[0] < 0:
-                    heapq.heappush(heap, (-float(candidate.log_weight[0]), next(order), candidate.match, part, agreeing))
+                    heapq.heappush(heap, (-float(other.log_weight[0]), next(order), other.match, part, agreeing))
     return found
 
 

@@ -68,7 +68,8 @@ def pack_frames(problems: Sequence[tuple[ArrayLike, ArrayLike]]) -> Frames:
         InputError: wrong shapes, a NaN, a plus infinity, or a finite value beyond `LARGEST`; names frame, detection
             and landmark.
     """
-    likelihoods, nulls, shapes = [], [], np.zeros((len(problems), 2), dtype=np.int64)
+    likelihoods, nulls = [], []
+    rows, columns, cells = [0], [0], [0]
     for frame, (likelihood, null) in enumerate(problems):
         likelihood, null = np.asarray(likelihood, dtype=np.float64), np.asarray(null, dtype=np.float64)
         if likelihood.ndim != 2 or null.shape != likelihood.shape[:1]:
@@ -79,12 +80,11 @@ def pack_frames(problems: Sequence[tuple[ArrayLike, ArrayLike]]) -> Frames:
             )
         likelihoods.append(likelihood.reshape(-1))
         nulls.append(null)
-        shapes[frame] = likelihood.shape
-    starts = np.zeros((3, len(problems) + 1), dtype=np.int64)
-    np.cumsum(shapes[:, 0], out=starts[0, 1:])
-    np.cumsum(shapes[:, 1], out=starts[1, 1:])
-    np.cumsum(shapes[:, 0] * shapes[:, 1], out=starts[2, 1:])
-    frames = Frames(_join(likelihoods), _join(nulls), starts[0], starts[1], starts[2])
+        n, m = likelihood.shape
+        rows.append(rows[-1] + n)
+        columns.append(columns[-1] + m)
+        cells.append(cells[-1] + n * m)
+    frames = Frames(_join(likelihoods), _join(nulls), np.array(rows), np.array(columns), np.array(cells))
     _check_values(frames)
     return frames
 
@@ -96,23 +96,25 @@ def _join(parts: list[np.ndarray]) -> np.ndarray:
     return np.ascontiguousarray(parts[0]) if len(parts) == 1 else np.concatenate(parts)
 
 
-def _unusable(values: np.ndarray) -> np.ndarray:
-    """Mask of what is neither a log weight within range nor minus infinity."""
-    return ~(values <= LARGEST) | ((values < -LARGEST) & (values > -np.inf))
+def _first_unusable(values: np.ndarray) -> int:
+    """Index of the first value that is neither a log weight within range nor minus infinity, or -1."""
+    magnitude = np.abs(values)
+    if magnitude.max(initial=0.0) <= LARGEST:  # false for NaN too
+        return -1
+    bad = ~(magnitude <= LARGEST) & (values != -np.inf)
+    return int(np.argmax(bad)) if bad.any() else -1
 
 
 def _check_values(frames: Frames) -> None:
     """Raise for the first unusable value, by detection and landmark."""
-    bad = _unusable(frames.log_likelihood)
-    if bad.any():
-        cell = int(np.argmax(bad))
+    cell = _first_unusable(frames.log_likelihood)
+    if cell >= 0:
         frame = int(np.searchsorted(frames.cell_start, cell, side="right")) - 1
         row, column = divmod(cell - int(frames.cell_start[frame]), frames.shape(frame)[1])
         where = f"{frames.name(frame)}detection {row} and landmark {column}"
         raise _value_error(f"unusable log likelihood of {where}", float(frames.log_likelihood[cell]))
-    bad = _unusable(frames.log_null)
-    if bad.any():
-        index = int(np.argmax(bad))
+    index = _first_unusable(frames.log_null)
+    if index >= 0:
         frame = int(np.searchsorted(frames.row_start, index, side="right")) - 1
         where = f"{frames.name(frame)}detection {index - int(frames.row_start[frame])}"
         raise _value_error(f"unusable log weight of the null hypothesis of {where}", float(frames.log_null[index]))

@@ -83,18 +83,39 @@ def _schedule(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _take_step(before: np.ndarray, after: np.ndarray, width: int, slots: np.ndarray, r: np.ndarray, b: float) -> None:
-    """Forward recursion of one step: `after` from `before`, both over subsets of the open members."""
+    """Forward recursion of one step: `after` from `before`, both over subsets of the open members.
+
+    The lowest three bits go together, eight states in registers; the others by contiguous slices, which vectorise
+    (one plain loop over bits and states takes 4 to 7 times longer).
+    """
     size = 1 << width
-    for state in range(size):
-        after[state] = b * before[state]
-    for bit in range(width):
+    if width < 3:
+        for state in range(size):
+            after[state] = b * before[state]
+    else:
+        r0, r1, r2 = r[slots[0]], r[slots[1]], r[slots[2]]
+        for block in range(size >> 3):
+            s = 8 * block
+            f0, f1, f2, f3, f4, f5, f6 = (
+                before[s], before[s + 1], before[s + 2], before[s + 3], before[s + 4], before[s + 5], before[s + 6],
+            )  # fmt: skip
+            after[s] = b * f0
+            after[s + 1] = b * f1 + r0 * f0
+            after[s + 2] = b * f2 + r1 * f0
+            after[s + 3] = b * f3 + r1 * f1 + r0 * f2
+            after[s + 4] = b * f4 + r2 * f0
+            after[s + 5] = b * f5 + r2 * f1 + r0 * f4
+            after[s + 6] = b * f6 + r2 * f2 + r1 * f4
+            after[s + 7] = b * before[s + 7] + r2 * f3 + r1 * f5 + r0 * f6
+    for bit in range(0 if width < 3 else 3, width):
         weight = r[slots[bit]]
         if weight == 0.0:
             continue
         stride = 1 << bit
         for high in range(0, size, 2 * stride):
-            for state in range(high, high + stride):
-                after[state + stride] += weight * before[state]
+            source, target = before[high : high + stride], after[high + stride : high + 2 * stride]
+            for low in range(stride):
+                target[low] += weight * source[low]
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
@@ -108,20 +129,49 @@ def _undo_step(
     """
     size = 1 << width
     without = 0.0
-    for state in range(size):
-        behind[state] = b * ahead[state]
-        without += before[state] * ahead[state]
-    for bit in range(width):
+    if width < 3:
+        for state in range(size):
+            behind[state] = b * ahead[state]
+            without += before[state] * ahead[state]
+    else:
+        r0, r1, r2 = r[slots[0]], r[slots[1]], r[slots[2]]
+        m0, m1, m2 = 0.0, 0.0, 0.0
+        for block in range(size >> 3):
+            s = 8 * block
+            f0, f1, f2, f3, f4, f5, f6 = (
+                before[s], before[s + 1], before[s + 2], before[s + 3], before[s + 4], before[s + 5], before[s + 6],
+            )  # fmt: skip
+            g0, g1, g2, g3, g4, g5, g6, g7 = (
+                ahead[s], ahead[s + 1], ahead[s + 2], ahead[s + 3], ahead[s + 4], ahead[s + 5], ahead[s + 6],
+                ahead[s + 7],
+            )  # fmt: skip
+            behind[s] = b * g0 + r0 * g1 + r1 * g2 + r2 * g4
+            behind[s + 1] = b * g1 + r1 * g3 + r2 * g5
+            behind[s + 2] = b * g2 + r0 * g3 + r2 * g6
+            behind[s + 3] = b * g3 + r2 * g7
+            behind[s + 4] = b * g4 + r0 * g5 + r1 * g6
+            behind[s + 5] = b * g5 + r1 * g7
+            behind[s + 6] = b * g6 + r0 * g7
+            behind[s + 7] = b * g7
+            m0 += f0 * g1 + f2 * g3 + f4 * g5 + f6 * g7
+            m1 += f0 * g2 + f1 * g3 + f4 * g6 + f5 * g7
+            m2 += f0 * g4 + f1 * g5 + f2 * g6 + f3 * g7
+            without += f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3 + f4 * g4 + f5 * g5 + f6 * g6 + before[s + 7] * g7
+        marginal[slots[0]] = r0 * m0 / evidence
+        marginal[slots[1]] = r1 * m1 / evidence
+        marginal[slots[2]] = r2 * m2 / evidence
+    for bit in range(0 if width < 3 else 3, width):
         weight = r[slots[bit]]
         if weight == 0.0:
             continue
         stride = 1 << bit
         total = 0.0
         for high in range(0, size, 2 * stride):
-            for state in range(high, high + stride):
-                taken = ahead[state + stride]
-                behind[state] += weight * taken
-                total += before[state] * taken
+            source, target = before[high : high + stride], behind[high : high + stride]
+            taken = ahead[high + stride : high + 2 * stride]
+            for low in range(stride):
+                target[low] += weight * taken[low]
+                total += source[low] * taken[low]
         marginal[slots[bit]] = weight * total / evidence
     return without / evidence
 
@@ -253,7 +303,8 @@ def sum_frames(
         out = weights[cell_start[frame] : cell_start[frame + 1]].reshape(n, m)
         null_in = log_null[row_start[frame] : row_start[frame + 1]]
         null_out = null[row_start[frame] : row_start[frame + 1]]
-        ours, theirs = rows[component_rows[c] : component_rows[c + 1]], columns[component_columns[c] : component_columns[c + 1]]
+        ours = rows[component_rows[c] : component_rows[c + 1]]
+        theirs = columns[component_columns[c] : component_columns[c + 1]]
         reduced, alone_member, alone_step = gather(
             values, null_in, u[row_start[frame] : row_start[frame + 1]],
             v[column_start[frame] : column_start[frame + 1]], ours, theirs, over_rows[c], smallest,

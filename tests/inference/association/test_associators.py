@@ -47,7 +47,7 @@ def test_beyond_the_budget_belief_propagation_takes_over_and_says_so() -> None:
     assert exact.exact and not ours.exact and ours.residual is not None and ours.residual < 1e-11
     np.testing.assert_allclose(ours.weights[8:], exact.weights[8:], rtol=0, atol=1e-15)
     assert 1e-9 < np.abs(ours.weights - exact.weights).max() < 0.05
-    assert ours.log_evidence == pytest.approx(exact.log_evidence, abs=0.1)
+    assert exact.log_evidence - 0.3 < ours.log_evidence < exact.log_evidence  # Bethe bounds permanents from below
 
 
 def test_forty_by_forty_dense_is_answered() -> None:

@@ -18,14 +18,15 @@ from nolbo_ppl.inference.association import (
 def test_unusable_values_name_detection_and_landmark(value: float) -> None:
     likelihood, null = np.zeros((3, 4)), np.zeros(3)
     likelihood[2, 1] = value
-    with pytest.raises(InputError, match=r"log likelihood of detection 2 and landmark 1: got (nan|inf|1e\+300|-1e\+16)"):
+    got = r"got (nan|inf|1e\+300|-1e\+16)"
+    with pytest.raises(InputError, match=r"log likelihood of detection 2 and landmark 1: " + got):
         association_marginals(likelihood, null)
     with pytest.raises(InputError, match=r"log likelihood of frame 1, detection 2 and landmark 1"):
         association_marginals_batch([(np.zeros((1, 1)), np.zeros(1)), (likelihood, null)])
     with pytest.raises(InputError, match="detection 2 and landmark 1"):
         map_association(likelihood, null)
     null[1] = value
-    with pytest.raises(InputError, match=r"null hypothesis of detection 1: got (nan|inf|1e\+300|-1e\+16)"):
+    with pytest.raises(InputError, match=r"null hypothesis of detection 1: " + got):
         association_marginals(np.zeros((3, 4)), null)
 
 
