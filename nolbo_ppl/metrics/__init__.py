@@ -1,1 +1,1 @@
-
+"""Figures of merit: detection, viewpoint, shape, calibration, intervals, trajectories and association."""
