@@ -75,7 +75,9 @@ def bessel_gap(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 def bessel_ratio(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """`A(x) = I1(x) / I0(x)`, the mean resultant length of a von Mises distribution of concentration x >= 0."""
-    return 1 - bessel_gap(x)
+    large, small, inverse = _branches(x)
+    series = 1 - 0.5 * inverse * (1 + inverse * _series(_GAP_EXCESS, inverse))
+    return torch.where(large, series, torch.special.i1e(small) / torch.special.i0e(small))
 
 
 def bessel_ratio_over_x(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -253,14 +253,16 @@ class VonMisesMixture(TorchDistribution):
         return -(log_density.exp() * log_density).sum(0) * (2 * math.pi / nodes)
 
     def hpd_mass(
-        self, value: Float[Tensor, "*value"], order: Int[Tensor, "*#batch"] | int = 1, nodes: int = 1024
+        self, value: Float[Tensor, "*value"], order: Int[Tensor, "*#batch"] | int = 1, nodes: int | None = None
     ) -> Float[Tensor, "*shape"]:
         """Probability of all angles with a density above that at `value`, folded by the symmetry group.
 
         `value` is inside the highest-density region of probability c exactly where this is at most c, so over truths
         drawn from the density it is uniform: the test of calibration. Order 0 gives zero. Not differentiated; the
-        level set is cut linearly between nodes, so the error falls with nodes^-2 (1e-4 at the defaults).
+        level set is cut linearly between `64 sqrt(max_concentration)` nodes: wrong by at most 2e-3 at the very top of a
+        narrow mode, by 2e-4 elsewhere.
         """
+        nodes = nodes or 64 * math.ceil(math.sqrt(self.max_concentration))
         with torch.no_grad():
             order = torch.as_tensor(order, device=self.natural.device)
             coefficients = self.folded(order)

@@ -18,9 +18,10 @@ from nolbo_ppl.models.distributions.wrapped_normal import WrappedNormal
 def _gaussian_rule(p: WrappedNormal, max_concentration: float) -> tuple[Tensor, Tensor]:
     """Nodes and weights of E under N(0, 1): the trapezoidal rule, spaced for `log q` of a mixture.
 
-    Where two components cross, `log q` has branch points as close as `pi / (2 kappa)` to the real axis, and
-    Gauss-Hermite rules (exact for polynomials, which `log q` of a mixture does not resemble) gain nothing over
-    equidistant nodes, for which the error is known: `exp(-2 pi distance / spacing)`, negligible beside the Gaussian's.
+    Where two components cross, `log q` has branch points as close as `pi / (2 kappa)` to the real axis. A Gauss-Hermite
+    rule, exact for the polynomials that `log q` does not resemble there, is the worse one: with kappa = 300, a scale of
+    0.05 rad and the crossing anywhere, the worst error at a KL below 10 nats is 2e-3 with 49 of its nodes against 2e-5.
+    In double precision the spacing reaches 1e-10 in every case, in single 5e-3 (1e-4 where the KL is a few nats).
     """
     double = p.scale.dtype == torch.float64
     reach, relative, absolute = (8.4, 0.5, 0.0368) if double else (6.0, 0.5, 0.433)
@@ -92,7 +93,7 @@ def kl_mixture_to_wrapped(
     log_q = q.log_density(p.loc + grid.reshape((-1,) + (1,) * len(shape)))
     density = log_q.exp()
     negative_entropy = (density * log_q).sum(0) * (2 * math.pi / nodes)
-    squared = (density * table[order].movedim(-1, 0)).sum(0)
+    squared = (density * table[order.expand(shape)].movedim(-1, 0)).sum(0)
     count = order.clamp_min(1).to(p.scale.dtype)
     log_peak = -0.5 * math.log(2 * math.pi) - torch.log(p.scale) - torch.log(count)
     divergence = negative_entropy + squared / (2 * p.scale * p.scale) - log_peak
