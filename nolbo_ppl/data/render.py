@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, UInt8
 
-from nolbo_ppl.data import textures
+from nolbo_ppl.data import shading, textures
 from nolbo_ppl.data.materials import Material, material_table
 
 NEAR = 1e-3
@@ -44,7 +43,8 @@ class Mesh:
         """Unit normal of each face; zero for a degenerate one."""
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
-        return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        return normal.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,16 @@ class Surface:
     colours: Float[np.ndarray, "2 3"]
     """Two albedos, linear RGB; the pattern mixes them."""
     pattern: str = "plain"
-    """"plain", "noise", "checker", "stripes" or "tiles"."""
+    """One of `textures.PLANE_PATTERNS`."""
     frequency: float = 1.0
     """Periods per scene unit."""
     seed: int = 0
     """Which random texture."""
+
+    def arrays(self) -> tuple[np.ndarray, int, float, int]:
+        """Colours, number of the pattern, frequency and seed, as the compiled shading takes them."""
+        colours = np.ascontiguousarray(self.colours, dtype=np.float32)
+        return colours, textures.PLANE_PATTERNS.index(self.pattern), float(self.frequency), int(self.seed)
 
 
 @dataclass(frozen=True)
@@ -242,24 +247,6 @@ def trace(view: View) -> Hits:
     )  # fmt: skip
 
 
-@numba.njit(cache=True)
-def _behind_ball(points: np.ndarray, dark: np.ndarray, centre: np.ndarray, radius: float, light: np.ndarray):
-    """Numbers of the points, not dark yet, whose ray to the light may meet a ball, and their offsets from its centre."""
-    chosen = np.empty(len(points), dtype=np.int64)
-    offset = np.empty((len(points), 3), dtype=np.float32)
-    count = 0
-    for i in range(len(points)):
-        if dark[i]:
-            continue
-        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        along = -(x * light[0] + y * light[1] + z * light[2])
-        if along > -radius and x * x + y * y + z * z - along * along < radius * radius:
-            chosen[count] = i
-            offset[count, 0], offset[count, 1], offset[count, 2] = x, y, z
-            count += 1
-    return chosen[:count], offset[:count]
-
-
 def shadowed(
     view: View, points: Float[np.ndarray, "n 3"], light: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " n"]:
@@ -268,7 +255,7 @@ def shadowed(
     points, light = _f32(points, light)
     for placed in view.placed:
         centre, inverse = _f32(placed.offset, placed.inverse)
-        near, offset = _behind_ball(points, dark, centre, np.float32(placed.radius), light)
+        near, offset = shading.behind_ball(points, dark, centre, np.float32(placed.radius), light)
         if len(near):
             rays = np.empty_like(offset)
             rays[:] = inverse @ light
@@ -278,192 +265,80 @@ def shadowed(
 
 def _f32(*arrays: np.ndarray) -> list[np.ndarray]:
     """Single precision, which every per-pixel array keeps."""
-    return [np.asarray(array, dtype=np.float32) for array in arrays]
+    return [np.ascontiguousarray(array, dtype=np.float32) for array in arrays]
 
 
-def _sky(view: View, directions: np.ndarray) -> np.ndarray:
-    """Colour of the sky in unit directions [n, 3]; below the horizon that of the horizon."""
-    up, zenith, horizon = _f32(view.up, view.backdrop.zenith, view.backdrop.horizon)
-    mix = np.sqrt(np.clip(directions @ up * np.float32(1.6), 0, 1))[:, None]
-    return horizon + mix * (zenith - horizon)
-
-
-def _mirrored(view: View, directions: np.ndarray) -> np.ndarray:
-    """What a mirror shows in unit directions [n, 3]: the sky, and the ground's ambient light below the horizon."""
-    up, below = _f32(view.up, view.ambient_ground * 0.8)
-    return np.where((directions @ up)[:, None] >= 0, _sky(view, directions), below)
-
-
-def _surface_colour(surface: Surface, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-    """Albedo of a plane at 2D points (scene units); the pattern fades where a pixel covers more than a period."""
-    scaled = (points * surface.frequency).astype(np.float32)
-    match surface.pattern:
-        case "noise":
-            mix = np.clip(1.6 * textures.fractal_noise(scaled, surface.seed, 4) - 0.3, 0, 1)
-        case "checker":
-            mix = textures.checker(scaled)
-        case "stripes":
-            mix = textures.stripes(scaled[:, 0], 0.5)
-        case "tiles":
-            mix = textures.tiles(scaled)
-        case _:
-            mix = np.full(len(points), 0.5, dtype=np.float32)
-    fade = 1 / (1 + (np.float32(2 * surface.frequency) * footprint) ** 2)
-    mix = (0.5 + (mix - 0.5) * fade)[:, None]
-    (colours,) = _f32(surface.colours)
-    return colours[0] + mix * (colours[1] - colours[0])
-
-
-def _diffuse(view: View, normals: np.ndarray, lit: list[np.ndarray]) -> np.ndarray:
-    """Light a matt surface of albedo 1 sends back: hemisphere ambient plus each light's cosine where it shines."""
-    up, below, above = _f32(view.up, view.ambient_ground, view.ambient_sky)
-    total = below + (0.5 + 0.5 * (normals @ up))[:, None] * (above - below)
-    for light, shines in zip(view.lights, lit):
-        direction, colour = _f32(light.direction, light.colour)
-        total += colour * (np.clip(normals @ direction, 0, None) * shines)[:, None]
-    return total
-
-
-def _lit(view: View, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
-    """For each light, one where it reaches the points and zero where it does not."""
-    result = []
-    lifted = points + normals * (np.float32(2e-3) * points[:, 2:] + np.float32(1e-5))
-    for light in view.lights:
-        (direction,) = _f32(light.direction)
-        shines = normals @ direction > 0
-        if light.shadow and shines.any():
-            facing = np.flatnonzero(shines)
-            shines[facing] = ~shadowed(view, lifted[facing], direction)
-        result.append(shines.astype(np.float32))
-    return result
-
-
-def _shade_meshes(view: View, hits: Hits, pixels: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Colour of the pixels (flat numbers) that show a mesh; Blinn-Phong with a mirrored sky."""
-    index, face = hits.index.ravel()[pixels], hits.face.ravel()[pixels]
-    points = directions * hits.depth.ravel()[pixels, None]
-    normals = np.empty_like(points)
-    local = np.empty_like(points)
-    material = np.empty(len(pixels), dtype=np.int64)
-    texture_seed = np.zeros(len(pixels), dtype=np.int64)
-    first = np.cumsum([0] + [len(placed.materials) for placed in view.placed])
-    for k, placed in enumerate(view.placed):
-        own = np.flatnonzero(index == k)
-        normals[own] = placed.mesh.normals[face[own]] @ placed.inverse  # gradients transform by the inverse transpose
-        local[own] = (points[own] - placed.offset) @ placed.inverse.T
-        material[own] = first[k] + placed.mesh.part[face[own]]
-        texture_seed[own] = placed.texture_seed
-    normals /= np.sqrt(np.maximum(np.einsum("nd,nd->n", normals, normals), 1e-30))[:, None]
-    eye = -directions / np.sqrt(np.einsum("nd,nd->n", directions, directions))[:, None]
-    facing = np.einsum("nd,nd->n", normals, eye)
-    normals *= np.where(facing < 0, -1.0, 1.0)[:, None].astype(np.float32)
-    facing = np.abs(facing)
-    table = material_table([m for placed in view.placed for m in placed.materials])
-    albedo = table.albedo[material]
-    albedo = albedo * _pattern(table, material, local, texture_seed)[:, None]
-    lit = _lit(view, points, normals)
-    colour = albedo * (_diffuse(view, normals, lit) + table.glow[material][:, None])
-    for light, shines in zip(view.lights, lit):
-        direction, light_colour = _f32(light.direction, light.colour)
-        half = eye + direction
-        half /= np.sqrt(np.einsum("nd,nd->n", half, half))[:, None]
-        highlight = np.clip(np.einsum("nd,nd->n", normals, half), 0, 1) ** table.shininess[material]
-        colour += light_colour * (highlight * table.specular[material] * shines)[:, None]
-    shiny = np.flatnonzero(table.mirror[material] > 0)
-    if len(shiny):
-        n, e = normals[shiny], eye[shiny]
-        mirrored = 2 * facing[shiny, None] * n - e
-        strength = table.mirror[material[shiny]]
-        strength = strength + (1 - strength) * 0.6 * (1 - facing[shiny]) ** 5
-        colour[shiny] = colour[shiny] * (1 - strength[:, None]) + _mirrored(view, mirrored) * strength[:, None]
-    return colour
-
-
-def _pattern(table, material: np.ndarray, local: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """Factor on the albedo from the material's solid texture."""
-    factor = np.ones(len(material), dtype=np.float32)
-    kind = table.pattern[material]
-    for s in np.unique(seed):
-        for number, texture in ((1, textures.value_noise), (2, textures.wood)):
-            own = np.flatnonzero((kind == number) & (seed == s))
-            if len(own):
-                scaled = local[own] * table.frequency[material[own], None]
-                factor[own] = 1 + table.contrast[material[own]] * (2 * texture(scaled, int(s)) - 1)
-        own = np.flatnonzero((kind == 3) & (seed == s))
-        if len(own):
-            scaled = local[own, 2] * table.frequency[material[own]]
-            factor[own] = 1 + table.contrast[material[own]] * (2 * textures.stripes(scaled) - 1)
-    return factor
-
-
-def _shade_backdrop(view: View, pixels: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Colour of the pixels (flat numbers) that show no mesh: picture, ground with shadows, wall, sky."""
-    backdrop = view.backdrop
-    (up,) = _f32(view.up)
-    drop = -(directions @ up)
-    distance = np.where(drop > 1e-4, view.camera_height / np.maximum(drop, 1e-4), np.inf).astype(np.float32)
-    if backdrop.picture is not None:
-        colour = backdrop.picture.reshape(-1, 3)[pixels].astype(np.float32)
-    else:
-        colour = np.empty_like(directions)
-        sky = np.flatnonzero(drop < 0.06)  # where the haze below is not clear yet
-        unit = directions[sky] / np.linalg.norm(directions[sky], axis=1, keepdims=True)
-        colour[sky] = _sky(view, unit)
-        if backdrop.clouds > 0:
-            cloud = textures.fractal_noise(unit * 4.0, backdrop.seed, 3) - 0.5
-            colour[sky] *= (1 + np.float32(backdrop.clouds) * cloud)[:, None]
-        if backdrop.wall is not None:
-            (normal,) = _f32(backdrop.wall_normal)
-            towards = directions @ normal
-            reach = np.where(towards > 1e-4, backdrop.wall_distance / np.maximum(towards, 1e-4), np.inf)
-            own = np.flatnonzero(reach < distance)
-            colour[own] = _shade_plane(view, backdrop.wall, directions[own] * reach[own, None], -normal, up, False)
-            distance = np.where(reach < distance, np.inf, distance)
-    own = np.flatnonzero(np.isfinite(distance))
-    points = directions[own] * distance[own, None]
-    if backdrop.picture is not None:
-        normals = np.broadcast_to(up, points.shape)
-        light = _diffuse(view, normals, _lit(view, points, normals))
-        full = _diffuse(view, normals[:1], [np.ones(1, dtype=np.float32)] * len(view.lights))
-        colour[own] *= light / full
-        return colour
-    ground = _shade_plane(view, backdrop.ground, points, up, view.north, True)
-    haze = np.clip(distance[own] / np.float32(view.camera_height * 60.0), 0, 1)[:, None] ** 2
-    far = np.flatnonzero(haze[:, 0] > 0.1)
-    ground[far] += haze[far] * (colour[own[far]] - ground[far])
-    colour[own] = ground
-    return colour
-
-
-def _shade_plane(
-    view: View, surface: Surface, points: np.ndarray, normal: np.ndarray, along: np.ndarray, shadows: bool
-) -> np.ndarray:
-    """Colour of points on a plane whose texture runs in the direction `along`."""
-    along = along - normal * (along @ normal)
-    normal, along, across = _f32(normal, along / np.linalg.norm(along), np.cross(normal, along / np.linalg.norm(along)))
-    plane = np.stack((points @ along, points @ across), axis=1)
-    span = np.sqrt(np.einsum("nd,nd->n", points, points))
-    grazing = np.abs(points @ normal) / np.maximum(span, np.float32(1e-12))
-    footprint = span / (np.float32(view.intrinsics[0]) * np.maximum(grazing, np.float32(1e-3)))
-    normals = np.broadcast_to(normal, points.shape)
-    if shadows:
-        lit = _lit(view, points, normals)
-    else:
-        lit = [np.ones(len(points), dtype=np.float32)] * len(view.lights)
-    return _surface_colour(surface, plane, footprint) * _diffuse(view, normals, lit)
+def _stack(arrays: list[np.ndarray], shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+    """Stack or concatenate, giving an array of the right kind when there is none."""
+    return np.ascontiguousarray(arrays, dtype=dtype) if arrays else np.zeros(shape, dtype=dtype)
 
 
 def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
-    """Linear RGB of every pixel."""
-    columns, rows = _grid(0, 0, view.width, view.height)
-    directions = pixel_directions(columns, rows, view.intrinsics)
-    on_mesh = hits.index.ravel() >= 0
-    colour = np.empty((len(directions), 3), dtype=np.float32)
-    mesh_pixels, other = np.flatnonzero(on_mesh), np.flatnonzero(~on_mesh)
-    if len(mesh_pixels):
-        colour[mesh_pixels] = _shade_meshes(view, hits, mesh_pixels, directions[mesh_pixels])
-    if len(other):
-        colour[other] = _shade_backdrop(view, other, directions[other])
+    """Linear RGB of every pixel: surfaces, then shadows, then light."""
+    meshes = [placed.mesh for placed in view.placed]
+    counts = [len(mesh.faces) for mesh in meshes]
+    materials = [len(placed.materials) for placed in view.placed]
+    table = material_table([m for placed in view.placed for m in placed.materials])
+    backdrop = view.backdrop
+    up, north = _f32(view.up, view.north)
+    wall = backdrop.wall if backdrop.wall is not None else backdrop.ground
+    wall_normal = up if backdrop.wall_normal is None else _f32(backdrop.wall_normal)[0]
+    points, normals, albedo, kind = shading.surfaces(
+        view.width,
+        _f32(view.intrinsics)[0],
+        hits.index.ravel(),
+        hits.face.ravel(),
+        hits.depth.ravel(),
+        _stack([placed.inverse for placed in view.placed], (1, 3, 3)),
+        _stack([placed.offset for placed in view.placed], (1, 3)),
+        np.cumsum([0, *counts]),
+        np.concatenate([mesh.normals for mesh in meshes]) if meshes else np.zeros((1, 3), np.float32),
+        np.concatenate([mesh.part for mesh in meshes]) if meshes else np.zeros(1, np.int64),
+        np.cumsum([0, *materials]),
+        _stack([placed.texture_seed for placed in view.placed], (1,), np.int64),
+        table.albedo,
+        table.pattern,
+        table.contrast,
+        table.frequency,
+        up,
+        np.float32(view.camera_height),
+        north,
+        backdrop.ground.arrays(),
+        backdrop.wall is not None and backdrop.picture is None,
+        wall_normal,
+        np.float32(backdrop.wall_distance),
+        wall.arrays(),
+    )
+    lit = np.ones((len(view.lights), len(points)), dtype=np.bool_)
+    for number, light in enumerate(view.lights):
+        (direction,) = _f32(light.direction)
+        facing, lifted = shading.facing_points(points, normals, kind, direction)
+        if light.shadow and len(facing):
+            lit[number, facing] = ~shadowed(view, lifted, direction)
+    has_picture = backdrop.picture is not None
+    picture = _f32(backdrop.picture.reshape(-1, 3))[0] if has_picture else np.zeros((1, 3), np.float32)
+    colour = shading.illuminate(
+        view.width,
+        _f32(view.intrinsics)[0],
+        points,
+        normals,
+        albedo,
+        kind,
+        lit,
+        _stack([light.direction for light in view.lights], (0, 3)),
+        _stack([light.colour for light in view.lights], (0, 3)),
+        up,
+        *_f32(view.ambient_sky, view.ambient_ground, backdrop.zenith, backdrop.horizon),
+        table.specular,
+        table.shininess,
+        table.mirror,
+        table.glow,
+        np.float32(view.camera_height),
+        np.float32(backdrop.clouds),
+        backdrop.seed,
+        has_picture,
+        picture,
+    )
     return colour.reshape(view.height, view.width, 3)
 
 

@@ -1,6 +1,4 @@
-"""Procedural textures: value noise, wood, stripes and checks as functions of position, without any picture.
-
-The noise is compiled: in NumPy its many temporaries took a fifth of the rendering time.
+"""Procedural textures: value noise, wood, stripes, checks and tiles as compiled functions of position.
 """
 
 from __future__ import annotations
@@ -26,34 +24,37 @@ def _lattice(x: np.uint32, y: np.uint32, z: np.uint32, seed: np.uint32) -> np.fl
 
 
 @numba.njit(cache=True)
+def noise_at(x: float, y: float, z: float, seed: int, octaves: int, solid: bool) -> float:
+    """Fractal noise in [0, 1) at one point; without `solid` the noise is two-dimensional and z is not used."""
+    total, weight = np.float32(0), np.float32(0)
+    for octave in range(octaves):
+        scale = np.float32(1 << octave)
+        sx, sy, sz = x * scale, y * scale, z * scale
+        fx, fy, fz = math.floor(sx), math.floor(sy), math.floor(sz)
+        ix, iy, iz = np.uint32(np.int64(fx)), np.uint32(np.int64(fy)), np.uint32(np.int64(fz))
+        ux, uy, uz = np.float32(sx - fx), np.float32(sy - fy), np.float32(sz - fz)
+        ux, uy, uz = ux * ux * (3 - 2 * ux), uy * uy * (3 - 2 * uy), uz * uz * (3 - 2 * uz)
+        s = np.uint32(seed + octave)
+        value = np.float32(0)
+        for k in range(2 if solid else 1):
+            kz = np.uint32(iz + np.uint32(k)) if solid else np.uint32(0)
+            wz = (uz if k else 1 - uz) if solid else np.float32(1)
+            for j in range(2):
+                ky = np.uint32(iy + np.uint32(j))
+                wy = uy if j else 1 - uy
+                low, high = _lattice(ix, ky, kz, s), _lattice(np.uint32(ix + np.uint32(1)), ky, kz, s)
+                value += wz * wy * (low * (1 - ux) + high * ux)
+        total += value / scale
+        weight += np.float32(1) / scale
+    return total / weight
+
+
+@numba.njit(cache=True)
 def _noise(points: np.ndarray, seed: int, octaves: int) -> np.ndarray:
-    n, d = points.shape
-    result = np.empty(n, dtype=np.float32)
-    for i in range(n):
-        total, weight = np.float32(0), np.float32(0)
-        for octave in range(octaves):
-            scale = np.float32(1 << octave)
-            x, y = points[i, 0] * scale, points[i, 1] * scale
-            z = points[i, 2] * scale if d == 3 else np.float32(0)
-            fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-            ix, iy, iz = np.uint32(np.int64(fx)), np.uint32(np.int64(fy)), np.uint32(np.int64(fz))
-            ux, uy, uz = np.float32(x - fx), np.float32(y - fy), np.float32(z - fz)
-            ux, uy, uz = ux * ux * (3 - 2 * ux), uy * uy * (3 - 2 * uy), uz * uz * (3 - 2 * uz)
-            s = np.uint32(seed + octave)
-            value = np.float32(0)
-            for k in range(2 if d == 3 else 1):
-                wz = (uz if k else 1 - uz) if d == 3 else np.float32(1)
-                for j in range(2):
-                    wy = uy if j else 1 - uy
-                    a = _lattice(ix, np.uint32(iy + np.uint32(j)), np.uint32(iz + np.uint32(k)), s)
-                    b = _lattice(
-                        np.uint32(ix + np.uint32(1)), np.uint32(iy + np.uint32(j)), np.uint32(iz + np.uint32(k)), s
-                    )
-                    value += wz * wy * (a * (1 - ux) + b * ux)
-            share = np.float32(1) / scale
-            total += share * value
-            weight += share
-        result[i] = total / weight
+    result = np.empty(len(points), dtype=np.float32)
+    solid = points.shape[1] == 3
+    for i in range(len(points)):
+        result[i] = noise_at(points[i, 0], points[i, 1], points[i, 2] if solid else 0.0, seed, octaves, solid)
     return result
 
 
@@ -68,29 +69,27 @@ def fractal_noise(points: Float[np.ndarray, "n d"], seed: int, octaves: int = 3)
     return _noise(np.ascontiguousarray(points, dtype=np.float32), int(seed) & 0x7FFFFFFF, octaves)
 
 
-def value_noise(points: Float[np.ndarray, "n d"], seed: int) -> Float[np.ndarray, " n"]:
-    """One octave of `fractal_noise`."""
-    return fractal_noise(points, seed, 1)
+@numba.njit(cache=True)
+def wood_at(x: float, y: float, z: float, seed: int) -> float:
+    """Grain along the x axis, in [0, 1]: rings disturbed by noise. Position in units of the ring spacing."""
+    rings = y + 2 * noise_at(0.1 * x, y, z, seed, 1, True)
+    return 0.5 + 0.5 * math.sin(2 * math.pi * rings)
 
 
-def checker(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Zero and one on alternating unit squares."""
-    return (np.floor(points).sum(axis=1) % 2).astype(np.float32)
+PLANE_PATTERNS: tuple[str, ...] = ("plain", "noise", "checker", "stripes", "tiles")
+"""Textures of large planes, by number for `plane_pattern`."""
 
 
-def stripes(position: Float[np.ndarray, " n"], duty: float = 0.5) -> Float[np.ndarray, " n"]:
-    """One on a share `duty` of every unit period, else zero."""
-    return (position - np.floor(position) < duty).astype(np.float32)
-
-
-def tiles(points: Float[np.ndarray, "n 2"], joint: float = 0.06) -> Float[np.ndarray, " n"]:
-    """One inside unit tiles, zero on the joints between them."""
-    fraction = points - np.floor(points)
-    return ((fraction > joint) & (fraction < 1.0 - joint)).all(axis=1).astype(np.float32)
-
-
-def wood(points: Float[np.ndarray, "n 3"], seed: int) -> Float[np.ndarray, " n"]:
-    """Grain along the x axis, in [0, 1]: rings disturbed by noise. Positions in units of the ring spacing."""
-    stretched = points * np.array([0.1, 1.0, 1.0], dtype=np.float32)
-    rings = stretched[:, 1] + 2.0 * value_noise(stretched, seed)
-    return (0.5 + 0.5 * np.sin(2 * np.pi * rings)).astype(np.float32)
+@numba.njit(cache=True)
+def plane_pattern(pattern: int, u: float, v: float, seed: int) -> float:
+    """How much of the second colour a plane shows at (u, v), in [0, 1]; positions in units of the period."""
+    if pattern == 1:
+        return min(max(1.6 * noise_at(u, v, 0.0, seed, 4, False) - 0.3, 0.0), 1.0)
+    if pattern == 2:
+        return float((math.floor(u) + math.floor(v)) % 2)
+    if pattern == 3:
+        return 1.0 if u - math.floor(u) < 0.5 else 0.0
+    if pattern == 4:
+        a, b = u - math.floor(u), v - math.floor(v)
+        return 1.0 if 0.06 < a < 0.94 and 0.06 < b < 0.94 else 0.0
+    return 0.5
