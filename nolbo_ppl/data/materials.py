@@ -75,16 +75,10 @@ def material_table(materials: Sequence[Material]) -> MaterialTable:
     )
 
 
-def linear(srgb: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Linear light of display values in [0, 1] (gamma 2.2)."""
-    return np.asarray(srgb) ** 2.2
-
-
 def hsv(hue: float, saturation: float, value: float) -> tuple[float, float, float]:
-    """Linear RGB of a display colour given by hue, saturation and value, all in [0, 1]."""
-    channel = (np.array([5.0, 3.0, 1.0]) + 6.0 * hue) % 6.0
-    rgb = value - value * saturation * np.clip(np.minimum(channel, 4.0 - channel), 0.0, 1.0)
-    r, g, b = linear(rgb).tolist()
+    """Linear RGB (gamma 2.2) of a display colour given by hue, saturation and value, all in [0, 1]."""
+    channels = ((n + 6.0 * hue) % 6.0 for n in (5.0, 3.0, 1.0))
+    r, g, b = ((value - value * saturation * max(0.0, min(k, 4.0 - k, 1.0))) ** 2.2 for k in channels)
     return r, g, b
 
 

@@ -11,10 +11,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from nolbo_ppl.data import textures
-from nolbo_ppl.data.materials import hsv, linear
+from nolbo_ppl.data.materials import hsv
 from nolbo_ppl.errors import input_error
 
 SUFFIXES: tuple[str, ...] = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
+"""Linear light of eight-bit display values (gamma 2.2)."""
 KEPT = 512
 """Decoded photographs held in memory."""
 
@@ -69,7 +71,7 @@ class Photographs:
         crop = np.asarray(crop.resize((width, height), Image.Resampling.BILINEAR, reducing_gap=2.0))
         if rng.random() < 0.5:
             crop = crop[:, ::-1]
-        return linear(crop.astype(np.float32) / 255)
+        return LINEAR[crop]
 
 
 def drawn_picture(rng: np.random.Generator, height: int, width: int) -> Float[np.ndarray, "{height} {width} 3"]:

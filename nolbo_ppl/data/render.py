@@ -174,37 +174,36 @@ class Hits:
 
 
 def pixel_directions(
-    columns: Float[np.ndarray, " n"], rows: Float[np.ndarray, " n"], intrinsics: Float[np.ndarray, "4"]
+    x0: int, y0: int, x1: int, y1: int, intrinsics: Float[np.ndarray, "4"], step: int = 1
 ) -> Float[np.ndarray, "n 3"]:
-    """Rays with z = 1 through the centres of pixels given by whole column and row; float32."""
+    """Rays with z = 1 through the pixel centres of columns x0 to x1 and rows y0 to y1, row by row; float32."""
     fx, fy, cx, cy = intrinsics
-    x = (columns + 0.5 - cx) / fx
-    y = (rows + 0.5 - cy) / fy
-    return np.stack((x, y, np.ones_like(x)), axis=-1).astype(np.float32)
+    x = (np.arange(x0, x1, step) + 0.5 - cx) / fx
+    y = (np.arange(y0, y1, step) + 0.5 - cy) / fy
+    rays = np.ones((len(y), len(x), 3), dtype=np.float32)
+    rays[..., 0], rays[..., 1] = x, y[:, None]
+    return rays.reshape(-1, 3)
 
 
 def _first_hits(placed: Placed, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Face (or -1) and depth of the first hit of rays from the camera with z = 1."""
     origin = (-(placed.inverse @ placed.offset)).astype(np.float32)
     local = directions @ placed.inverse.T.astype(np.float32)
+    if not len(local):  # Embree's wrapper does not take an empty set of rays
+        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.float32)
     origins = np.empty_like(local)
     origins[:] = origin
     hit = placed.mesh.scene.run(origins, local, output=1)
     return hit["primID"], np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
 
 
-def _window(placed: Placed, intrinsics: np.ndarray) -> Float[np.ndarray, "4"] | None:
-    """Box [x0, y0, x1, y1] of the projected vertices; None when some lie behind the camera."""
+def image_window(placed: Placed, intrinsics: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"] | None:
+    """Box [x0, y0, x1, y1] px of the projected vertices; None when some lie behind the camera."""
     points = placed.vertices
     if points[:, 2].min() <= NEAR:
         return None
     pixels = points[:, :2] / points[:, 2:] * intrinsics[:2] + intrinsics[2:]
     return np.concatenate((pixels.min(axis=0), pixels.max(axis=0)))
-
-
-def _grid(x0: int, y0: int, x1: int, y1: int, step: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    columns, rows = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
-    return columns.ravel(), rows.ravel()
 
 
 def trace(view: View) -> Hits:
@@ -218,14 +217,13 @@ def trace(view: View) -> Hits:
     face = np.full((height, width), -1, dtype=np.int32)
     silhouette = np.zeros(len(view.placed))
     for k, placed in enumerate(view.placed):
-        window = _window(placed, view.intrinsics)
+        window = image_window(placed, view.intrinsics)
         window = np.array([0.0, 0.0, width, height]) if window is None else window
         x0, y0 = np.maximum(np.floor(window[:2]), [-width, -height]).astype(int)
         x1, y1 = np.minimum(np.ceil(window[2:]), [2 * width, 2 * height]).astype(int)
         a0, b0, a1, b1 = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
         if a1 > a0 and b1 > b0:
-            columns, rows = _grid(a0, b0, a1, b1)
-            primitive, t = _first_hits(placed, pixel_directions(columns, rows, view.intrinsics))
+            primitive, t = _first_hits(placed, pixel_directions(a0, b0, a1, b1, view.intrinsics))
             silhouette[k] += np.count_nonzero(primitive >= 0)
             box = np.s_[b0:b1, a0:a1]
             primitive, t = primitive.reshape(b1 - b0, a1 - a0), t.reshape(b1 - b0, a1 - a0)
@@ -233,11 +231,10 @@ def trace(view: View) -> Hits:
             depth[box][nearer], index[box][nearer], face[box][nearer] = t[nearer], k, primitive[nearer]
         if placed.owner >= 0 and (x0, y0, x1, y1) != (a0, b0, a1, b1) and x1 > x0 and y1 > y0:
             step = int(np.ceil(np.sqrt((x1 - x0) * (y1 - y0) / 16384)))
-            columns, rows = _grid(x0, y0, x1, y1, step)
-            beyond = (columns < 0) | (columns >= width) | (rows < 0) | (rows >= height)
-            if beyond.any():
-                rays = pixel_directions(columns[beyond], rows[beyond], view.intrinsics)
-                silhouette[k] += np.count_nonzero(_first_hits(placed, rays)[0] >= 0) * step**2
+            rays = pixel_directions(x0, y0, x1, y1, view.intrinsics, step)
+            pixels = rays[:, :2] * view.intrinsics[:2] + view.intrinsics[2:]
+            beyond = ((pixels < 0) | (pixels > [width, height])).any(axis=1)
+            silhouette[k] += np.count_nonzero(_first_hits(placed, rays[beyond])[0] >= 0) * step**2
     owners = np.array([placed.owner for placed in view.placed] + [-1])
     visible = np.bincount(owners[index[index >= 0]] + 1, minlength=owners.max() + 2)
     return Hits(

@@ -19,8 +19,9 @@ from nolbo_ppl.data.backdrop import sample_backdrop, sample_light
 from nolbo_ppl.data.materials import Material, sample_material, sample_materials
 from nolbo_ppl.data.pictures import Photographs
 from nolbo_ppl.data.pool import BLOCK, Item, ShapePool
-from nolbo_ppl.data.render import Hits, Mesh, Placed, View, average_down, shade, to_display, trace
+from nolbo_ppl.data.render import Hits, Mesh, Placed, View, average_down, image_window, shade, to_display, trace
 from nolbo_ppl.data.scene_config import SceneConfig
+from nolbo_ppl.errors import input_error
 
 CAMERA_HEIGHT = 1.0
 """The scene's unit of length."""
@@ -312,11 +313,10 @@ def scene_at(
 
 def amodal_box(placed: Placed, view: View) -> Float[np.ndarray, "4"]:
     """Tight box of the projected vertices, cut to the image."""
-    points = placed.vertices
-    pixels = points[:, :2] / points[:, 2:] * view.intrinsics[:2] + view.intrinsics[2:]
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    limit = np.array([view.width, view.height])
-    return np.concatenate((np.clip(low, 0, limit), np.clip(high, 0, limit)))
+    window = image_window(placed, view.intrinsics)
+    if window is None:
+        raise input_error("object not wholly before the camera", got=placed.offset.tolist(), expected="every vertex z > 0")
+    return np.clip(window, 0, [view.width, view.height, view.width, view.height])
 
 
 def _fine(view: View, factor: int) -> View:
@@ -358,12 +358,10 @@ def _blurred(colour: np.ndarray, scale: float) -> np.ndarray:
         return colour
     weight = np.exp(-0.5 * (np.arange(-2, 3) / scale) ** 2).astype(np.float32)
     weight /= weight.sum()
-    for axis in (0, 1):
-        padding = [(2, 2) if i == axis else (0, 0) for i in range(3)]
-        padded = np.pad(colour, padding, mode="edge")
-        n = colour.shape[axis]
-        colour = sum(w * np.take(padded, np.arange(k, k + n), axis=axis) for k, w in enumerate(weight))
-    return colour
+    height, width = colour.shape[:2]
+    padded = np.pad(colour, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    rows = sum(w * padded[k : k + height] for k, w in enumerate(weight))
+    return sum(w * rows[:, k : k + width] for k, w in enumerate(weight))
 
 
 def render_scene(scene: Scene) -> Rendered:

@@ -18,13 +18,13 @@ class SceneConfig:
     """Height and width of the image, px; a multiple of 32."""
     categories: tuple[str, ...] = CATEGORIES
     """Categories drawn, each as often as the others."""
-    objects: tuple[int, int] = (1, 6)
+    objects: tuple[int, int] = (1, 5)
     """Number of objects tried in a scene; fewer remain where there is no room."""
     empty_probability: float = 0.03
     """Share of scenes without any object."""
-    clutter: tuple[int, int] = (0, 4)
+    clutter: tuple[int, int] = (0, 3)
     """Number of things that are no object."""
-    object_pixels: tuple[float, float] = (14.0, 0.85)
+    object_pixels: tuple[float, float] = (18.0, 0.9)
     """Projected box diagonal of an object: least in px, greatest as a share of the image size; drawn log-uniformly."""
     clutter_pixels: tuple[float, float] = (8.0, 0.6)
     """The same for clutter."""
@@ -44,9 +44,9 @@ class SceneConfig:
     """Scale (standard deviation) of the roll of the camera, degrees, cut at three times that."""
     flying_probability: float = 0.4
     """Share of aeroplanes that are in the air, banked and pitched."""
-    near_probability: float = 0.35
+    near_probability: float = 0.25
     """Share of objects placed beside one that is there already, so that they occlude each other."""
-    truncation_probability: float = 0.15
+    truncation_probability: float = 0.1
     """Share of objects whose centre may lie anywhere in the image, so that its border cuts them."""
     least_visibility: float = 0.15
     """Objects of which less is seen are taken out of the scene (not only out of the labels)."""
@@ -56,7 +56,7 @@ class SceneConfig:
     """Weights of: plain ground and sky, textured ground and sky, a room with a wall, a drawn picture."""
     photographs: float = 0.5
     """Share of scenes before a photograph, when a folder of photographs is given."""
-    muted: float = 0.7
+    muted: float = 0.85
     """Share of grounds and walls in muted colours."""
     sun_elevation: tuple[float, float] = (25.0, 80.0)
     """Height of the main light, degrees."""
@@ -102,7 +102,7 @@ def standard(size: int = 128) -> SceneConfig:
 def full(size: int = 128) -> SceneConfig:
     """Everything at random: heavy clutter and occlusion, truncation, drawn or photographic pictures, coloured light."""
     return SceneConfig(
-        size=size, clutter=(0, 8), object_pixels=(12.0, 1.0), focal=(0.6, 3.0), elevation=(0.0, 50.0),
+        size=size, objects=(1, 6), clutter=(0, 8), object_pixels=(12.0, 1.0), focal=(0.6, 3.0), elevation=(0.0, 50.0),
         steep_probability=0.12, steep_elevation=85.0, roll=8.0, near_probability=0.45, truncation_probability=0.3,
         least_visibility=0.1, least_box=4.0, backgrounds=(0.15, 0.3, 0.2, 0.35), photographs=0.7, muted=0.4,
         sun_elevation=(10.0, 88.0), second_light_probability=0.4, tint=0.3, exposure=(0.5, 1.6), blur=0.9, noise=0.035,
