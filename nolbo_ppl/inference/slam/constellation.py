@@ -23,8 +23,10 @@ CONSISTENT = 14.0
 """Largest squared Mahalanobis distance between the gaps of two pairs (3 degrees of freedom: p = 0.003)."""
 CLIQUE_BUDGET = 5000
 """Cliques looked at in one window before the search is cut."""
-NODE_BUDGET = 600
+NODE_BUDGET = 400
 """Candidate pairs of one window, the best by evidence."""
+FEATURE_MINIMUM = -6.0
+"""Pairs whose features speak against them by more than this many nats join no constellation."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ def find_closing(
     """The best clique of one window's pairs, or None when it is too small, too weak or not unique."""
     if len(pairs) < config.constellation_minimum:
         return None
+    pairs = pairs.select(np.flatnonzero(pairs.log_feature > FEATURE_MINIMUM))
     if len(pairs) > NODE_BUDGET:
         pairs = pairs.select(np.argsort(-(pairs.log_position + pairs.log_feature), kind="stable")[:NODE_BUDGET])
     position = estimate.T_world_landmark[:, :3, 3]
