@@ -5,6 +5,9 @@ Grids are indexed [ix, iy, iz]; voxel i of n has its centre at (i + 0.5) / n - 0
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
@@ -92,3 +95,83 @@ def voxels_to_mesh(
     n = values.shape[0]
     vertices, faces, _, _ = marching_cubes(np.pad(values, 1), level, gradient_direction="ascent")
     return (vertices.astype(np.float64) - 0.5) / n - 0.5, faces.astype(np.int64)
+
+
+def reduce_voxels(grid: Bool[np.ndarray, "m m m"], n: int, share: float = 0.25) -> Bool[np.ndarray, "{n} {n} {n}"]:
+    """Resample a grid to n^3: a voxel is filled when at least `share` of the samples in it are.
+
+    At a quarter, rods and plates one fine voxel thick survive halving, and a solid's rounding is unbiased to half a
+    fine voxel. Where n divides m the samples are the fine voxels themselves; n = m changes nothing.
+    """
+    m = grid.shape[0]
+    per_axis = max(2, math.ceil(m / n))
+    ticks = (np.arange(n * per_axis) + 0.5) / (n * per_axis)
+    index = np.minimum((ticks * m).astype(np.int64), m - 1)
+    count = grid.astype(np.uint16)
+    for axis in range(3):
+        fine = np.take(count, index, axis=axis)
+        shape = list(fine.shape)
+        shape[axis : axis + 1] = [n, per_axis]
+        count = fine.reshape(shape).sum(axis=axis + 1)
+    return count >= share * per_axis**3
+
+
+def mesh_to_voxels(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], n: int, gap: int = 0
+) -> Bool[np.ndarray, "{n} {n} {n}"]:
+    """Solid occupancy of a mesh that need not be closed: the voxels its surface touches and those it shuts in.
+
+    The surface is sampled at half a voxel; the outside is flooded from the border through faces of voxels (six
+    neighbours), so that a surface one voxel thick holds. For meshes with small holes the surface is thickened by
+    `gap` voxels before the flood and the result thinned again; a mesh with a wider hole stays a shell.
+
+    Args:
+        vertices: in canonical coordinates; what lies outside [-0.5, 0.5]^3 is left out.
+        faces: triangles, of any orientation.
+        n: size of the grid.
+        gap: holes up to 2 `gap` voxels wide are closed. On 77 CAD models (simplified, many open) against solids made
+            from the full meshes, 1 raises the mean overlap from 0.71 to 0.78, 2 no further.
+    """
+    from scipy.ndimage import binary_dilation, binary_erosion, label  # delayed: heavy to import
+
+    border = 1 + gap  # empty, for the flood to go around the object
+    padded = np.zeros((n + 2 * border,) * 3, dtype=bool)
+    if len(faces):
+        for samples in _surface_samples(vertices[faces], 0.5 / n):
+            index = np.floor((samples.T + 0.5) * n).astype(np.int32)
+            if index.min() < 0 or index.max() >= n:
+                index = index[:, ((index >= 0) & (index < n)).all(axis=0)]
+            padded[tuple(index + border)] = True
+    ball = np.ones((3, 3, 3), dtype=bool)
+    walls = binary_dilation(padded, ball, iterations=gap) if gap > 0 else padded
+    region, _ = label(~walls)  # the corner of the border is outside
+    solid = region != region[0, 0, 0]
+    if gap > 0:
+        solid = binary_erosion(solid, ball, iterations=gap) | padded
+    return solid[border:-border, border:-border, border:-border]
+
+
+def _surface_samples(triangles: Float[np.ndarray, "f 3 3"], spacing: float) -> Iterator[Float[np.ndarray, "s 3"]]:
+    """Points about `spacing` apart at most on every triangle, in batches of triangles cut equally finely.
+
+    A triangle is cut along its longest side and along the height on it, so that slender ones cost little.
+    """
+    length = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=-1)
+    longest = length.argmax(axis=1)
+    order = (longest[:, None] + np.arange(3)) % 3  # corners 0 and 1 span the longest side
+    triangles = np.take_along_axis(triangles, order[:, :, None], axis=1)
+    base = np.maximum(length.max(axis=1), 1e-12)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    height = np.linalg.norm(cross, axis=-1) / base
+    # Powers of two keep the number of batches small.
+    cuts = np.stack([base, height], axis=-1) / spacing
+    cuts = 2 ** np.ceil(np.log2(np.maximum(cuts, 1.0))).astype(np.int64)
+    kinds, kind = np.unique(cuts, axis=0, return_inverse=True)
+    for i, (along, up) in enumerate(kinds):
+        s, t = np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(0, 1, up + 1))
+        s, t = s.ravel(), t.ravel()
+        weights = np.stack([(1 - t) * (1 - s), (1 - t) * s, t], axis=-1)
+        group = triangles[kind.reshape(-1) == i]
+        step = max(1, 500_000 // len(weights))
+        for first in range(0, len(group), step):
+            yield np.matmul(weights, group[first : first + step]).reshape(-1, 3)

@@ -225,7 +225,7 @@ def _steam(b: Builder, d: Draw, style: str) -> None:
     b.pair("metal", (half * 0.9, half * 0.96), (first - 0.1, first + (n - 1) * pitch + 0.1), (drive - 0.1, drive + 0.08))
     for sign in (-1.0, 1.0):
         b.cylinder(1, "dark_metal", (sign * half * 0.85, y0 + 0.8, frame * 0.75), 0.32, 0.5, segments=8)
-    b.side("trim", [(y0 - 0.9, 0.15), (y0 - 0.3, frame), (y0, frame), (y0, 0.15)], (half * 0.9, 0.15, 0.0))
+    b.side("trim", [(y0 - 0.9, 0.15), (y0 - 0.3, frame), (y0, frame), (y0, 0.15)], (half * 0.9 - 0.15 * y0, 0.15, 0.0))
     small = min(0.5, wheel * 0.6)
     for i in range(d.integer(1, 2)):
         for sign in (-1.0, 1.0):

@@ -33,7 +33,7 @@ def _lamps(b: Builder, d: Draw, front: float, rear: float, half: float, z: float
     top = rear_z - 0.04
     b.pair("light_rear", (half - red_w - 0.01, half - 0.01), (rear - 0.1, rear + PROUD), (top - red_h, top))
     b.box("trim", (-half - 0.02, half + 0.02), (rear - 0.25, rear + 0.06), (ground - 0.03, ground + d(0.12, 0.3)))
-    b.box("plate", (-0.26, 0.26), (rear - 0.1, rear + PROUD), (top - 0.26, top - 0.14), decal=True)
+    b.box("plate", (-0.26, 0.26), (rear - 0.05, rear + PROUD), (top - 0.26, top - 0.14), decal=True)
 
 
 def _wheels(b: Builder, d: Draw, front: float, rear: float, half: float, radius: float) -> None:
