@@ -1,0 +1,246 @@
+"""`nolbo evaluate`: figures of an observation model on unseen scenes, with intervals, plots and examples."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from nolbo_ppl import __version__
+from nolbo_ppl.data.scene import Rendered
+from nolbo_ppl.data.scene_config import preset
+from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.measure import SceneTruth, measure_detections, measure_objects
+from nolbo_ppl.inference.queries import ObservationModel
+from nolbo_ppl.inference.weights import load
+from nolbo_ppl.io import write_json
+from nolbo_ppl.metrics.figures import (
+    DetectionRecords,
+    ObjectRecords,
+    category_table,
+    concatenate,
+    confusion,
+    difficulty_table,
+    figures,
+)
+from nolbo_ppl.metrics.intervals import Estimate
+
+SEED = 9001
+"""Default seed of generated scenes: neither the scenes nor the shapes of another seed are among them."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Evaluate a model on scenes it has not seen and write figures, plots and examples."""
+
+    out: Path
+    """Folder for metrics.json and the pictures."""
+    model: str = "tiny"
+    """Name of shipped weights, or a folder with model.safetensors and config.json."""
+    scenes: Path | None = None
+    """Folder of labelled scenes (scenes.jsonl); without it scenes are generated."""
+    count: int = 500
+    """Scenes to generate, or at most to read."""
+    seed: int = SEED
+    """Seed of the generated scenes and their shapes."""
+    difficulty: str = "standard"
+    """Generated scenes: easy, standard or full."""
+    cad: Path | None = None
+    """Folder of CAD shapes to generate scenes from, in place of parametric ones."""
+    backgrounds: Path | None = None
+    """Folder of photographs behind generated scenes."""
+    least_side: float = 12.0
+    """Objects whose box has no side of so many px do not count, nor does a detection of them."""
+    least_visibility: float = 0.5
+    """Objects of which less is seen do not count either."""
+    threshold: float = 0.01
+    """Least objectness of a detection."""
+    resamples: int = 500
+    """Bootstrap resamples of the scenes behind the intervals."""
+    batch: int = 32
+    """Scenes that go through the network at once."""
+    pictures: bool = True
+    """Draw plots and examples."""
+
+
+class Scenes(Protocol):
+    """Labelled scenes by number."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> SceneTruth: ...
+
+
+@dataclass(frozen=True)
+class GeneratedScenes:
+    """Scenes rendered when they are asked for."""
+
+    source: SceneSource
+    count: int
+    categories: tuple[str, ...]
+    """The model's categories: what the labels are numbered by."""
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> SceneTruth:
+        return truth_of_rendered(self.source.render(index), self.categories)
+
+
+def truth_of_rendered(rendered: Rendered, categories: Sequence[str]) -> SceneTruth:
+    """Labels of a rendered scene as arrays; a category the model does not know is -1."""
+    labels, n = rendered.labels, len(rendered.labels)
+    return SceneTruth(
+        image=rendered.image,
+        intrinsics=rendered.intrinsics,
+        box=np.array([label.box for label in labels]).reshape(n, 4),
+        category=np.array([_label(label.category, categories) for label in labels], dtype=np.int64),
+        R_camera_object=np.array([label.R_camera_object for label in labels]).reshape(n, 3, 3),
+        position=np.array([label.position for label in labels]).reshape(n, 3),
+        symmetry=np.array([label.symmetry for label in labels], dtype=np.int64),
+        visibility=np.array([label.visibility for label in labels], dtype=np.float64),
+        voxels=np.array([label.item.voxels for label in labels], dtype=np.uint8).reshape(n, -1 if n else 0),
+    )
+
+
+def _label(category: str, categories: Sequence[str]) -> int:
+    return categories.index(category) if category in categories else -1
+
+
+def open_scenes(config: EvaluateConfig, model: ObservationModel) -> Scenes:
+    """The scenes the configuration asks for. Raises `InputError` when there are none."""
+    if config.count < 1:
+        raise input_error("number of scenes", got=config.count, expected="at least 1")
+    categories = model.config.categories
+    cad = None
+    if config.cad is not None:
+        from nolbo_ppl.data.cad import load_cad_folder
+
+        cad = tuple(load_cad_folder(config.cad, categories))
+    source = SceneSource(
+        preset(config.difficulty, model.config.image_size), seed=config.seed, cad=cad,
+        backgrounds=None if config.backgrounds is None else str(config.backgrounds),
+    )  # fmt: skip
+    return GeneratedScenes(source, config.count, categories)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything measured."""
+
+    objects: ObjectRecords
+    detections: DetectionRecords
+    figures: dict[str, Estimate]
+    scenes: int
+    categories: tuple[str, ...]
+
+
+def measure(config: EvaluateConfig, model: ObservationModel, scenes: Scenes) -> Evaluation:
+    """Run the model over the scenes and compute every figure.
+
+    Raises:
+        InputError: no scene holds an object that counts.
+    """
+    objects: list[ObjectRecords] = []
+    boxes, labels, counts, answers = [], [], [], []
+    for start in tqdm(range(0, len(scenes), config.batch), desc="evaluating", unit="batch", disable=None):
+        rows = range(start, min(start + config.batch, len(scenes)))
+        truth = [scenes[i] for i in rows]
+        images, cameras = [scene.image for scene in truth], np.array([scene.intrinsics for scene in truth])
+        found = model.observe(images, cameras, threshold=config.threshold, decode=False, batch=config.batch)
+        answers += [(one.box, one.objectness, one.class_posterior) for one in found]
+        counted = [scene.counts(config.least_side, config.least_visibility) for scene in truth]
+        boxes += [scene.box for scene in truth]
+        labels += [scene.category for scene in truth]
+        counts += counted
+        used = [k for k, some in enumerate(counted) if some.any()]
+        if used:
+            slots = [np.flatnonzero(counted[k]) for k in used]
+            at_boxes = model.observe_boxes(
+                [images[k] for k in used], cameras[used], [truth[k].box[s] for k, s in zip(used, slots)],
+                decode=False, batch=config.batch,
+            )  # fmt: skip
+            objects.append(measure_objects([truth[k] for k in used], at_boxes, slots, [rows[k] for k in used], model))
+    if not objects:
+        raise input_error(
+            "no object to evaluate on", got=f"{len(scenes)} scenes",
+            expected=f"a box with a side of {config.least_side} px, {config.least_visibility:.0%} of it seen",
+        )  # fmt: skip
+    categories = model.config.categories
+    records = concatenate(objects)
+    detections = measure_detections(boxes, labels, counts, answers, len(categories))
+    rng = np.random.default_rng(config.seed)
+    estimates = figures(records, detections, len(scenes), model.config.symmetry, rng, config.resamples)
+    return Evaluation(records, detections, estimates, len(scenes), categories)
+
+
+def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
+    """The content of metrics.json: figures by name, their intervals and counts, tables, and what they came from."""
+    estimates = evaluation.figures
+    return {
+        **{name: one.value for name, one in estimates.items()},
+        "intervals": {name: None if one.low is None else [one.low, one.high] for name, one in estimates.items()},
+        "counts": {name: one.count for name, one in estimates.items()},
+        "scenes": evaluation.scenes,
+        "objects": len(evaluation.objects),
+        "by_category": category_table(evaluation.objects, evaluation.detections, evaluation.categories),
+        "by_difficulty": difficulty_table(evaluation.objects),
+        "confusion": confusion(evaluation.objects, len(evaluation.categories)).tolist(),
+        "categories": list(evaluation.categories),
+        "configuration": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()},
+        "seeds": {"scenes": config.seed if config.scenes is None else None, "bootstrap": config.seed},
+        "versions": {
+            "nolbo_ppl": __version__, "python": platform.python_version(), "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+    }  # fmt: skip
+
+
+def table(evaluation: Evaluation) -> str:
+    """The figures with their 95 % intervals, and the main ones by category, as text."""
+    lines = [f"{'figure':<24}{'value':>9}   {'95 % interval':<20}{'of':>7}"]
+    for name, one in evaluation.figures.items():
+        interval = "" if one.low is None or one.high is None else f"[{one.low:.3f}, {one.high:.3f}]"
+        lines.append(f"{name:<24}{_number(one.value):>9}   {interval:<20}{one.count:>7}")
+    columns = ("ap50", "category_accuracy", "acc_pi6", "med_err_deg", "voxel_iou", "voxel_iou_gain")
+    lines += ["", f"{'category':<14}{'objects':>8}" + "".join(f"{name:>19}" for name in columns)]
+    for name, row in category_table(evaluation.objects, evaluation.detections, evaluation.categories).items():
+        lines.append(f"{name:<14}{row['objects']:>8}" + "".join(f"{_number(row[column]):>19}" for column in columns))
+    return "\n".join(lines)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def evaluate(config: EvaluateConfig) -> Evaluation:
+    """Measure the model and write `metrics.json` and, unless switched off, the plots and examples into `config.out`."""
+    model = load(config.model)
+    scenes = open_scenes(config, model)
+    evaluation = measure(config, model, scenes)
+    write_json(config.out / "metrics.json", metrics(evaluation, config))
+    if config.pictures:
+        from nolbo_ppl.viz.evaluation import write_examples, write_plots
+
+        write_plots(evaluation.objects, evaluation.detections, evaluation.categories, model.config.symmetry, config.out)
+        write_examples(evaluation.objects, scenes, model, config.out / "examples.png")
+    return evaluation
+
+
+def main(config: EvaluateConfig) -> None:
+    """Run the verb and print the table."""
+    sys.stdout.write(table(evaluate(config)) + f"\n\nwritten to {config.out}\n")
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(EvaluateConfig))
