@@ -27,14 +27,20 @@ def pairwise_iou(a: Float[Tensor, "n 4"], b: Float[Tensor, "m 4"]) -> Float[Tens
 
 
 def nms(
-    boxes: Float[Tensor, "n 4"], scores: Float[Tensor, " n"], iou_threshold: float = 0.5
+    boxes: Float[Tensor, "n 4"],
+    scores: Float[Tensor, " n"],
+    iou_threshold: float = 0.5,
+    group: Int[Tensor, " n"] | None = None,
 ) -> Int[Tensor, " kept"]:
     """Indices that greedy non-maximum suppression keeps, best score first.
 
-    A box goes when it overlaps a kept box of a higher score by more than `iou_threshold`.
+    A box goes when it overlaps a kept box of a higher score, and of its own group where groups (images) are given, by
+    more than `iou_threshold`.
     """
     order = torch.argsort(scores, descending=True, stable=True)
     iou = pairwise_iou(boxes[order], boxes[order])
+    if group is not None:
+        iou = torch.where(group[order][:, None] == group[order], iou, -1.0)
     kept: list[int] = []
     for i in range(len(order)):
         if not kept or bool((iou[i, kept] <= iou_threshold).all()):

@@ -130,7 +130,7 @@ def ray_rotation(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """
     x, y, z = (ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)).unbind(-1)
     if not bool((z > -1 + 1e-9).all()):
-        raise input_error("no rotation from the optical axis to a ray", got=ray.tolist(), expected="points before the camera")
+        raise input_error("no rotation from the optical axis to a ray", got=ray.tolist(), expected="a point in front")
     k = 1 / (1 + z)
     rows = (1 - k * x * x, -k * x * y, x, -k * x * y, 1 - k * y * y, y, -x, -y, z)
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
@@ -139,7 +139,7 @@ def ray_rotation(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def allocentric_to_egocentric(
     R_allocentric: Float[Tensor, "*batch 3 3"], ray: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """R_camera_object from the orientation relative to the viewing ray through the object's centre (method section 0)."""
+    """R_camera_object from the orientation relative to the ray through the object's centre (method section 0)."""
     return ray_rotation(ray) @ R_allocentric
 
 

@@ -212,8 +212,7 @@ class ObservationModel:
             return row, region
         q = self._parameters(encoding, row, region)
         box = decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
-        apart = 4 * max(encoding.rows, encoding.columns) * self.config.stride  # boxes of different images never overlap
-        kept = nms(box + (row * apart)[:, None], logit[row, region], iou_threshold)
+        kept = nms(box, logit[row, region], iou_threshold, group=row)
         kept = kept[torch.argsort(row[kept], stable=True)]
         return row[kept], region[kept]
 
