@@ -173,12 +173,12 @@ def best_assignments(frames: Frames) -> BestAssignments:
     return best
 
 
-def map_association(log_likelihood: Float[ArrayLike, "n m"], log_null: Float[ArrayLike, " n"]) -> Association:
+def map_association(log_likelihood: ArrayLike, log_null: ArrayLike) -> Association:
     """The most probable joint association of a frame, exact at any size.
 
     Args:
-        log_likelihood: log weight of each detection and landmark in nats, -inf for the impossible.
-        log_null: log weight of each detection's null hypothesis in nats, -inf when it must be a landmark.
+        log_likelihood: [n, m] log weight of each detection and landmark in nats, -inf for the impossible.
+        log_null: [n] log weight of each detection's null hypothesis in nats, -inf when it must be a landmark.
 
     Raises:
         InputError: wrong shapes, NaN or plus infinity, or no association is possible.

@@ -14,7 +14,7 @@ from nolbo_ppl.inference.association.propagation import ITERATIONS, TOLERANCE, p
 from nolbo_ppl.inference.association.subsets import gather, sum_frames
 
 BUDGET = 2**24
-"""Default limit of the exact sum: subsets kept for one component, 8 bytes each (128 MB, about a second)."""
+"""Default limit of the exact sum: subsets kept for one component, 8 bytes each (128 MB, about half a second)."""
 GATE = 1e-12
 """Default reduced weight below which a detection and a landmark do not interact."""
 

@@ -11,7 +11,6 @@ import heapq
 from itertools import count as counter
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from nolbo_ppl.errors import input_error
@@ -19,10 +18,13 @@ from nolbo_ppl.inference.association.assignment import Association, best_assignm
 from nolbo_ppl.inference.association.problem import Frames, pack_frames
 
 
-def k_best_associations(
-    log_likelihood: Float[ArrayLike, "n m"], log_null: Float[ArrayLike, " n"], k: int
-) -> list[Association]:
+def k_best_associations(log_likelihood: ArrayLike, log_null: ArrayLike, k: int) -> list[Association]:
     """The `k` most probable joint associations of a frame, best first; all of them when there are fewer.
+
+    Args:
+        log_likelihood: [n, m] log weight of each detection and landmark in nats, -inf for the impossible.
+        log_null: [n] log weight of each detection's null hypothesis in nats.
+        k: how many to list.
 
     Raises:
         InputError: k below 1, wrong shapes, NaN or plus infinity, or no association is possible.

@@ -42,8 +42,8 @@ class AssociationMarginals:
 
 
 def association_marginals(
-    log_likelihood: Float[ArrayLike, "n m"],
-    log_null: Float[ArrayLike, " n"],
+    log_likelihood: ArrayLike,
+    log_null: ArrayLike,
     *,
     associator: Associator = "exact",
     budget: float = BUDGET,
@@ -57,12 +57,13 @@ def association_marginals(
     `log_likelihood` is `weights`.
 
     Args:
-        log_likelihood: log weight of each detection and landmark in nats, -inf for the impossible.
-        log_null: log weight of each detection's null hypothesis in nats, -inf when it must be a landmark.
+        log_likelihood: [n, m] log weight of each detection and landmark in nats, -inf for the impossible.
+        log_null: [n] log weight of each detection's null hypothesis in nats, -inf when it must be a landmark.
         associator: how to find them, see `Associator`.
         budget: largest number of subsets the exact sum may keep for one connected component (8 bytes each).
-        gate: reduced weights (see `assignment`) below this are taken as zero. An association through one is at least
-            1 / gate times less probable than the best; many equally good ones may add up to a little more than gate.
+        gate: reduced weights (see `assignment`) below this are taken as zero: an association through one is 1 / gate
+            times less probable than the best, or worse. Many ties can add up: an error of 1e-12 on random problems,
+            of up to 2^(n - 2) gate in a contrived staircase of exact ties without null hypotheses. 0 keeps all.
         k: how many associations "k_best" sums.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numba import njit
 from numpy.typing import ArrayLike
 
@@ -59,8 +59,8 @@ def _draw(
 
 
 def sample_associations(
-    log_likelihood: Float[ArrayLike, "n m"],
-    log_null: Float[ArrayLike, " n"],
+    log_likelihood: ArrayLike,
+    log_null: ArrayLike,
     *,
     rng: np.random.Generator,
     count: int = 1,
@@ -70,8 +70,8 @@ def sample_associations(
     """Independent samples of the joint association: the landmark of every detection, -1 for its null hypothesis.
 
     Args:
-        log_likelihood: log weight of each detection and landmark in nats, -inf for the impossible.
-        log_null: log weight of each detection's null hypothesis in nats.
+        log_likelihood: [n, m] log weight of each detection and landmark in nats, -inf for the impossible.
+        log_null: [n] log weight of each detection's null hypothesis in nats.
         rng: the source of randomness.
         count: number of samples.
         budget: largest number of subsets kept for one component (8 bytes each).

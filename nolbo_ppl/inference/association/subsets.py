@@ -227,8 +227,8 @@ def _forward(
     chain[0] = 1.0
     for step in range(steps):
         before = store[offset[step] : offset[step + 1]]
-        before[:kept] = chain[at : at + kept]
-        before[kept:] = 0.0
+        for state in range(before.shape[0]):  # members that open are in no state yet
+            before[state] = chain[at + state] if state < kept else 0.0
         _take_step(before, chain, width[step], slots[step], weights[step], alone_step[step])
         at, open_count = _close_all(chain, step, width[step], slots[step], last, alone_member)
         kept = 1 << open_count
@@ -275,7 +275,8 @@ def sum_component(
         )
         idle_step[step] = alone_step[step] * idle
         kept = 1 << (width[step] - opened[step])
-        ahead[:kept] = behind[:kept]
+        for state in range(kept):
+            ahead[state] = behind[state]
     return evidence
 
 
@@ -340,10 +341,12 @@ def backward_component(
             if last[member] == step:
                 open_count += 1
                 _reopen(ahead, open_count, bit, alone_member[member])
-        store[offset[step] : offset[step + 1]] = ahead[: 1 << width[step]]
+        for state in range(1 << width[step]):
+            store[offset[step] + state] = ahead[state]
         _undo_step(
             unused, ahead, behind, width[step], slots[step], weights[step], alone_step[step], 1.0, marginal
         )  # the marginals are of no use here
         kept = 1 << (width[step] - opened[step])
-        ahead[:kept] = behind[:kept]
+        for state in range(kept):
+            ahead[state] = behind[state]
     return store, offset, width, slots, last

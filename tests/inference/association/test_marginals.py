@@ -164,13 +164,31 @@ def test_the_objectness_of_a_detection_without_null_cancels() -> None:
     plain = association_marginals(likelihood, np.full(4, -np.inf))
     scaled = association_marginals(likelihood + objectness[:, None], np.full(4, -np.inf))
     np.testing.assert_allclose(scaled.weights, plain.weights, atol=1e-13)
-    with_null = association_marginals(likelihood, np.zeros(4)), association_marginals(
-        likelihood + objectness[:, None], np.log1p(-np.exp(objectness))
+    with_null = (
+        association_marginals(likelihood, np.zeros(4)),
+        association_marginals(likelihood + objectness[:, None], np.log1p(-np.exp(objectness))),
     )
     assert np.abs(with_null[0].weights - with_null[1].weights).max() > 0.01
 
 
-def _determinant_free_chain(rng: np.random.Generator, length: int) -> tuple[np.ndarray, np.ndarray]:
+def test_the_gate_costs_what_its_documentation_says(enumerate_associations) -> None:
+    """About the gate on random problems; 2^(n - 2) times the gated weight where exact ties pile up."""
+    rng = np.random.default_rng(13)
+    for _ in range(100):
+        n, m = rng.integers(1, 9, size=2)
+        likelihood, null = 20 * rng.normal(size=(n, m)), 20 * rng.normal(size=n)
+        gated, full = association_marginals(likelihood, null), association_marginals(likelihood, null, gate=0.0)
+        np.testing.assert_allclose(gated.weights, full.weights, rtol=0, atol=5e-12)
+    ties = np.where(np.triu(np.ones((6, 6))) > 0, 0.0, -np.inf)
+    ties[5, 0] = np.log(0.9e-12)
+    forced = np.full(6, -np.inf)
+    truth = enumerate_associations(ties, forced)
+    np.testing.assert_allclose(association_marginals(ties, forced, gate=0.0).weights, truth.weights, atol=1e-15)
+    error = np.abs(association_marginals(ties, forced).weights - truth.weights).max()
+    assert error == pytest.approx(2**4 * 0.9e-12, rel=1e-3)
+
+
+def _chain(rng: np.random.Generator, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Detection i sees landmarks i and i + 1 alone: one component of any length, a frontier of one or two."""
     likelihood = np.full((length, length + 1), -np.inf)
     steps = np.arange(length)
@@ -178,10 +196,10 @@ def _determinant_free_chain(rng: np.random.Generator, length: int) -> tuple[np.n
     return likelihood, rng.normal(size=length)
 
 
-def test_a_long_chain_is_exact(enumerate_associations) -> None:
+def test_a_long_chain_is_exact() -> None:
     """A component of 200 detections and 201 landmarks: its Z by a three-term recursion along the chain."""
     rng = np.random.default_rng(21)
-    likelihood, null = _determinant_free_chain(rng, 200)
+    likelihood, null = _chain(rng, 200)
     free, taken = 0.0, -np.inf  # log sums with landmark i free or taken by detection i - 1
     for i in range(200):
         either = np.logaddexp(free, taken)
