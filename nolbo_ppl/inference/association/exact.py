@@ -35,7 +35,7 @@ class FrameSums:
         return np.isnan(self.residual)
 
 
-def sum_associations(frames: Frames, *, budget: float, gate: float) -> FrameSums:
+def sum_associations(frames: Frames, *, budget: int, gate: float) -> FrameSums:
     """Marginals and log evidence of every frame; components of more than `budget` subsets by belief propagation.
 
     A budget of 0 sends everything through belief propagation.

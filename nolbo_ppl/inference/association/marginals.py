@@ -46,7 +46,7 @@ def association_marginals(
     log_null: ArrayLike,
     *,
     associator: Associator = "exact",
-    budget: float = BUDGET,
+    budget: int = BUDGET,
     gate: float = GATE,
     k: int = 200,
 ) -> AssociationMarginals:
@@ -77,7 +77,7 @@ def association_marginals_batch(
     problems: Sequence[tuple[ArrayLike, ArrayLike]],
     *,
     associator: Associator = "exact",
-    budget: float = BUDGET,
+    budget: int = BUDGET,
     gate: float = GATE,
     k: int = 200,
 ) -> list[AssociationMarginals]:
@@ -93,7 +93,7 @@ def association_marginals_batch(
     if associator == "exact":
         return _exact(frames, budget, gate)
     if associator == "belief_propagation":
-        return _exact(frames, 0.0, gate)
+        return _exact(frames, 0, gate)
     if associator == "softmax":
         return [_softmax(frames, frame) for frame in range(len(frames))]
     if associator == "hungarian":
@@ -104,7 +104,7 @@ def association_marginals_batch(
     return [_k_best(frames, frame, k) for frame in range(len(frames))]
 
 
-def _exact(frames: Frames, budget: float, gate: float) -> list[AssociationMarginals]:
+def _exact(frames: Frames, budget: int, gate: float) -> list[AssociationMarginals]:
     """Exact sums within the budget, belief propagation beyond it."""
     sums = sum_associations(frames, budget=budget, gate=gate)
     evidence, exact, residual = sums.log_evidence.tolist(), sums.exact.tolist(), sums.residual.tolist()

@@ -188,6 +188,45 @@ def test_the_gate_costs_what_its_documentation_says(enumerate_associations) -> N
     assert error == pytest.approx(2**4 * 0.9e-12, rel=1e-3)
 
 
+def _log_sum(likelihood: np.ndarray, null: np.ndarray) -> float:
+    """Log evidence by a dictionary of the sets of landmarks taken, detection after detection, in plain Python."""
+    sums = {frozenset[int](): 1.0}
+    for row, alone in zip(np.exp(likelihood), np.exp(null)):
+        following: dict[frozenset[int], float] = {}
+        for taken, value in sums.items():
+            following[taken] = following.get(taken, 0.0) + value * alone
+            for column in np.flatnonzero(row > 0).tolist():
+                if column not in taken:
+                    grown = taken | {column}
+                    following[grown] = following.get(grown, 0.0) + value * row[column]
+        sums = following
+    return float(np.log(sum(sums.values())))
+
+
+@pytest.mark.parametrize("kind", ["band", "random", "two hubs"])
+def test_larger_sparse_components(kind: str) -> None:
+    """Components in which members open and close on the way: every marginal is a ratio of two evidences."""
+    rng = np.random.default_rng(17)
+    for n, m in [(9, 10), (11, 7), (7, 11), (10, 10), (12, 5)]:
+        kept = rng.random((n, m)) < 0.25
+        if kind == "band":
+            kept = np.abs(np.arange(n)[:, None] / n - np.arange(m) / m) < 0.2
+        elif kind == "two hubs":
+            kept[:, 0] = kept[0] = kept[-1] = True
+        likelihood, null = np.where(kept, rng.normal(size=(n, m)), -np.inf), rng.normal(size=n)
+        rows, columns = rng.permutation(n), rng.permutation(m)
+        likelihood = likelihood[np.ix_(rows, columns)]
+        ours, total = association_marginals(likelihood, null), _log_sum(likelihood, null)
+        assert ours.exact and ours.log_evidence == pytest.approx(total, abs=1e-11)
+        for i in range(n):
+            rest = np.delete(likelihood, i, axis=0), np.delete(null, i)
+            assert ours.null[i] == pytest.approx(np.exp(null[i] + _log_sum(*rest) - total), abs=1e-12)
+        for i, j in np.argwhere(np.isfinite(likelihood))[:: 1 + n * m // 40]:
+            rest = np.delete(np.delete(likelihood, i, axis=0), j, axis=1), np.delete(null, i)
+            expected = np.exp(likelihood[i, j] + _log_sum(*rest) - total)
+            assert ours.weights[i, j] == pytest.approx(expected, abs=1e-12)
+
+
 def _chain(rng: np.random.Generator, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Detection i sees landmarks i and i + 1 alone: one component of any length, a frontier of one or two."""
     likelihood = np.full((length, length + 1), -np.inf)
