@@ -59,18 +59,23 @@ def log_i0e(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.where(large, series, torch.log(torch.special.i0(small)) - small)
 
 
+def _direct_gap(x: Tensor) -> Tensor:
+    """`1 - I1 / I0` in double precision, of which the difference leaves all that single precision holds."""
+    double = x.double()
+    return (1 - torch.special.i1e(double) / torch.special.i0e(double)).to(x.dtype)
+
+
 def gap_excess(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """`2 x (1 - I1(x) / I0(x)) - 1` for x >= 0: what the mean resultant falls short of its Gaussian limit."""
     large, small, inverse = _branches(x)
-    direct = 2 * small * (1 - torch.special.i1e(small) / torch.special.i0e(small)) - 1
-    return torch.where(large, inverse * _series(_GAP_EXCESS, inverse), direct)
+    return torch.where(large, inverse * _series(_GAP_EXCESS, inverse), 2 * small * _direct_gap(small) - 1)
 
 
 def bessel_gap(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """`1 - I1(x) / I0(x)` for x >= 0, with full relative accuracy where the ratio is close to one."""
     large, small, inverse = _branches(x)
     series = 0.5 * inverse * (1 + inverse * _series(_GAP_EXCESS, inverse))
-    return torch.where(large, series, 1 - torch.special.i1e(small) / torch.special.i0e(small))
+    return torch.where(large, series, _direct_gap(small))
 
 
 def bessel_ratio(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

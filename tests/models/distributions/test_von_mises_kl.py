@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -16,7 +17,9 @@ from nolbo_ppl.models.distributions import (
 )
 
 
-def random_mixture(batch: int, seed: int, largest: float = 300.0, dtype: torch.dtype = torch.float64) -> VonMisesMixture:
+def random_mixture(
+    batch: int, seed: int, largest: float = 300.0, dtype: torch.dtype = torch.float64
+) -> VonMisesMixture:
     generator = torch.Generator().manual_seed(seed)
     logits = torch.randn(batch, 4, generator=generator, dtype=torch.float64)
     mean = 2 * math.pi * torch.rand(batch, 4, generator=generator, dtype=torch.float64)
@@ -64,7 +67,9 @@ def test_inclusive_kl_matches_dense_quadrature(order, scale) -> None:
 def test_inclusive_kl_at_the_crossing_of_two_narrow_components() -> None:
     """The worst case: the mean of p on the kink between two components of kappa 300, at many separations."""
     half = torch.linspace(0.05, 3.0, 25) / 2
-    q = VonMisesMixture.from_mean_concentration(torch.zeros(25, 2), torch.stack((-half, half), -1), torch.tensor([300.0, 300.0]))
+    q = VonMisesMixture.from_mean_concentration(
+        torch.zeros(25, 2), torch.stack((-half, half), -1), torch.tensor([300.0, 300.0])
+    )
     p = WrappedNormal(torch.zeros(25), torch.full((25,), 0.05))
     exact = dense_inclusive(p, q, 1, 50_000)
     torch.testing.assert_close(kl_divergence(p, q), exact, rtol=1e-10, atol=1e-10)
@@ -110,7 +115,7 @@ def scipy_exclusive(q: VonMisesMixture, p: WrappedNormal, i: int, order: int) ->
     modes = [(m - loc + math.pi) % (2 * math.pi) - math.pi for m in mean]
     points = sorted({-math.pi, math.pi, *(x for x in kinks + modes if -math.pi < x < math.pi)})
     return sum(
-        integrate.quad(integrand, a, b, epsabs=1e-11, epsrel=1e-12, limit=400)[0] for a, b in zip(points[:-1], points[1:])
+        integrate.quad(integrand, a, b, epsabs=1e-11, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(points)
     )
 
 
@@ -136,7 +141,9 @@ def test_exclusive_kl_of_mixed_orders_and_its_bound(circle) -> None:
         one = kl_mixture_to_wrapped(q, p, n)[i]
         torch.testing.assert_close(result[i], one)
         turns = [2 * math.pi * j / n for j in range(n)]
-        log_p = torch.logsumexp(torch.stack([p.log_prob((x + t + math.pi) % (2 * math.pi) - math.pi) for t in turns]), 0)
+        log_p = torch.logsumexp(
+            torch.stack([p.log_prob((x + t + math.pi) % (2 * math.pi) - math.pi) for t in turns]), 0
+        )
         log_q = q.log_prob(x)
         exact = ((log_q.exp() * (log_q - log_p + math.log(n))).sum(0) * (2 * math.pi / len(x)))[i]
         # The tangent form is the exact divergence but for the neglected modes, which only lower it.
@@ -153,7 +160,12 @@ def test_exclusive_kl_in_single_precision() -> None:
 def test_gradients() -> None:
     start = random_mixture(3, 13, largest=50.0)
     order = torch.tensor([1, 2, 0])
-    inputs = [start.logits.clone(), start.natural.clone(), torch.tensor([0.1, 2.0, 3.0]), torch.tensor([0.05, 0.1, 0.2])]
+    inputs = [
+        start.logits.clone(),
+        start.natural.clone(),
+        torch.tensor([0.1, 2.0, 3.0]),
+        torch.tensor([0.05, 0.1, 0.2]),
+    ]
     inputs = [x.requires_grad_() for x in inputs]
     for function in (
         lambda a, b, m, s: kl_wrapped_to_mixture(WrappedNormal(m, s), VonMisesMixture(a, b), order),
