@@ -5,26 +5,18 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float
 from tqdm import tqdm
 
-from nolbo_ppl.categories import CATEGORY_SYMMETRY
-from nolbo_ppl.data.cad_sizes import TYPICAL_DIAGONAL, typical_diagonal
-from nolbo_ppl.data.shapes.shape import Shape, Solid
+from nolbo_ppl.data.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
+from nolbo_ppl.data.cad_sizes import TYPICAL_DIAGONAL
+from nolbo_ppl.data.shapes.shape import Shape
 from nolbo_ppl.errors import NolboError, input_error
-from nolbo_ppl.geometry.voxels import (
-    mesh_to_voxels,
-    reduce_voxels,
-    unpack_voxels,
-    voxel_centres,
-    voxel_iou,
-    voxels_to_mesh,
-)
+from nolbo_ppl.geometry.voxels import voxels_to_mesh
 from nolbo_ppl.io import read_json
 
 SUFFIXES = (".off", ".obj", ".ply", ".glb")
@@ -32,39 +24,6 @@ ARCHIVE_FILES = ("meshes.npz", "meta.json", "voxels64.npz")
 ARCHIVE_VOXELS = 64
 BOX_TOLERANCE = 0.03
 """How far (in diagonals; two voxels of 64^3) a simplified mesh may miss its box before its voxels replace it."""
-
-Vertices = Float[np.ndarray, "v 3"]
-Faces = Int[np.ndarray, "f 3"]
-
-
-@dataclass
-class MeshSolid:
-    """A mesh, open or closed, voxelised on demand at twice the resolution (see `mesh_to_voxels`) and kept.
-
-    Holes up to one voxel wide are closed.
-    """
-
-    vertices: Vertices
-    faces: Faces
-    _cache: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
-
-    def fill(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
-        """Occupancy of n^3 voxels over [-0.5, 0.5]^3."""
-        if n not in self._cache:
-            self._cache[n] = reduce_voxels(mesh_to_voxels(self.vertices, self.faces, 2 * n, gap=1), n)
-        return self._cache[n].copy()
-
-
-@dataclass(frozen=True)
-class GridSolid:
-    """Voxels that came with the data, resampled on demand."""
-
-    packed: UInt8[np.ndarray, " bytes"]
-    size: int
-
-    def fill(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
-        """Occupancy of n^3 voxels over [-0.5, 0.5]^3."""
-        return reduce_voxels(unpack_voxels(self.packed, self.size), n)
 
 
 def load_cad_folder(
@@ -122,8 +81,10 @@ def load_cad_folder(
     if not shapes:
         which = "any category" if wanted is None else ", ".join(sorted(wanted))
         raise input_error(
-            "no CAD model found", expected=f"models of {which} as {', '.join(SUFFIXES)}",
-            do="name them CATEGORY/NAME.EXT or CATEGORY_NAME.EXT", file=folder,
+            "no CAD model found",
+            expected=f"models of {which} as {', '.join(SUFFIXES)}",
+            do="name them CATEGORY/NAME.EXT or CATEGORY_NAME.EXT",
+            file=folder,
         )
     return shapes
 
@@ -144,99 +105,6 @@ def axis_rotation(up: str, front: str) -> Float[np.ndarray, "3 3"]:
     return np.stack([np.cross(y, z), y, z])
 
 
-def mesh_to_shape(
-    category: str,
-    instance: str,
-    vertices: Vertices,
-    faces: Faces,
-    max_faces: int | None = None,
-    diagonals: Mapping[str, float] | None = None,
-    *,
-    solid: Solid | None = None,
-    file: str | os.PathLike[str] | None = None,
-) -> Shape:
-    """Make a `Shape` of a mesh that stands in the canonical orientation; it is centred and scaled here.
-
-    Raises:
-        InputError: no faces, faces pointing past the vertices, vertices that are not finite, or no area.
-    """
-    if len(faces) == 0:
-        raise input_error("CAD mesh without faces", got=f"{len(vertices)} vertices", file=file)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise input_error("CAD mesh with faces past its vertices", got=int(faces.max()), expected=f"< {len(vertices)}", file=file)
-    used = vertices[np.unique(faces)]
-    if not np.isfinite(used).all():
-        raise input_error("CAD mesh with vertices that are NaN or infinite", file=file)
-    low, high = used.min(axis=0), used.max(axis=0)
-    diagonal = float(np.linalg.norm(high - low))
-    points = (vertices - 0.5 * (low + high)) / (diagonal if diagonal > 0 else 1.0)
-    edge = points[faces[:, 1:]] - points[faces[:, :1]]
-    area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=-1)
-    if not area.sum() > 1e-9:
-        raise input_error("degenerate CAD mesh: its faces have no area", got=f"{len(faces)} faces", file=file)
-    points, faces = _simplify(points, faces[area > 0], max_faces)
-    fill: Solid = MeshSolid(points, faces) if solid is None else solid
-    return Shape(
-        category=category, instance=instance, vertices=points, faces=faces, part=np.zeros(len(faces), dtype=np.int64),
-        parts=("body",), diagonal=typical_diagonal(category, diagonals), symmetry=_symmetry(category, fill), solid=fill,
-    )
-
-
-def _symmetry(category: str, solid: Solid) -> int:
-    """Symmetry order of a model, by the overlap of its voxels with their turned copy."""
-    declared = CATEGORY_SYMMETRY.get(category)
-    if declared == 1:
-        return 1
-    grid = solid.fill(ARCHIVE_VOXELS // 2)
-
-    def overlap(degrees: float) -> float:
-        return float(voxel_iou(grid, _turned(grid, degrees)))
-
-    if min(overlap(45.0), overlap(20.0)) > 0.85:
-        return 0
-    if declared is None or overlap(180.0) <= 0.85:
-        return 1
-    return 4 if overlap(90.0) > 0.85 else 2
-
-
-def _turned(grid: np.ndarray, degrees: float) -> np.ndarray:
-    """Turn a grid about its vertical axis, each column from the nearest one; what comes from outside is empty."""
-    n = len(grid)
-    x, y = np.meshgrid(voxel_centres(n), voxel_centres(n), indexing="ij")
-    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    index = np.floor((np.stack([cos * x + sin * y, cos * y - sin * x]) + 0.5) * n + 1e-9).astype(np.int64)
-    inside = ((index >= 0) & (index < n)).all(axis=0)
-    i, j = np.clip(index, 0, n - 1)
-    return np.asarray(grid[i, j] & inside[..., None])
-
-
-def _simplify(vertices: Vertices, faces: Faces, max_faces: int | None) -> tuple[Vertices, Faces]:
-    """Drop unused vertices; merge those in one cell of a grid, ever coarser, until at most `max_faces` are left.
-
-    Clustering moves a vertex to the mean of its cell; it takes any mesh, open or not. The result is put back into the
-    unit box.
-    """
-    index, inverse = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[index], inverse.reshape(-1, 3)
-    cells, points, triangles = 512.0, vertices, faces
-    while max_faces is not None and len(triangles) > max_faces and cells > 4:
-        _, label = np.unique(np.floor((vertices + 0.5) * cells).astype(np.int64), axis=0, return_inverse=True)
-        label = label.reshape(-1)
-        count = np.bincount(label)
-        points = np.stack([np.bincount(label, vertices[:, i]) / count for i in range(3)], axis=-1)
-        triangles = label[faces]
-        a, b, c = triangles.T
-        triangles = triangles[(a != b) & (b != c) & (c != a)]
-        triangles = triangles[np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]]
-        cells *= 0.8
-    if points is not vertices:
-        index, inverse = np.unique(triangles, return_inverse=True)
-        points, triangles = points[index], inverse.reshape(-1, 3)
-        low, high = points.min(axis=0), points.max(axis=0)
-        points = (points - 0.5 * (low + high)) / np.linalg.norm(high - low)
-    return points, triangles.astype(np.int64)
-
-
 def _list_files(folder: Path) -> list[tuple[str, str, Path]]:
     """List (category, instance, file) of the two layouts of loose files, sorted; instance names are unique."""
     found: dict[str, tuple[str, str, Path]] = {}
@@ -251,7 +119,10 @@ def _list_files(folder: Path) -> list[tuple[str, str, Path]]:
         instance = f"{category}-{name}"
         if instance in found:
             raise input_error(
-                "two CAD models of one name", got=f"{file.name} and {found[instance][2].name}", do="rename one", file=file
+                "two CAD models of one name",
+                got=f"{file.name} and {found[instance][2].name}",
+                do="rename one",
+                file=file,
             )
         found[instance] = (category, instance, file)
     return list(found.values())
@@ -264,7 +135,10 @@ def _split_name(stem: str, file: Path) -> tuple[str, str]:
     name = stem[len(category) + 1 :]
     if not category or not name:
         raise input_error(
-            "CAD file whose category is not told", got=file.name, expected="CATEGORY_NAME.EXT, or CATEGORY/NAME.EXT", file=file
+            "CAD file whose category is not told",
+            got=file.name,
+            expected="CATEGORY_NAME.EXT, or CATEGORY/NAME.EXT",
+            file=file,
         )
     return category, name
 
@@ -298,15 +172,22 @@ def _load_archive(folder: Path, wanted: set[str] | None, diagonals: Mapping[str,
                     yield _archive_shape(name, info, meshes, solids[row[name]], diagonals, mesh_file)
     except (KeyError, zipfile.BadZipFile, OSError, TypeError, AttributeError) as error:
         raise input_error(
-            "malformed CAD archive", got=f"{type(error).__name__}: {error}", do="see load_cad_folder for its layout", file=folder
+            "malformed CAD archive",
+            got=f"{type(error).__name__}: {error}",
+            do="see load_cad_folder for its layout",
+            file=folder,
         ) from error
 
 
 def _archive_shape(
-    name: str, info: Mapping[str, Any], meshes: Mapping[str, np.ndarray], packed: np.ndarray,
-    diagonals: Mapping[str, float] | None, file: Path,
+    name: str,
+    info: Mapping[str, Any],
+    meshes: Mapping[str, np.ndarray],
+    packed: np.ndarray,
+    diagonals: Mapping[str, float] | None,
+    file: Path,
 ) -> Shape:
-    """Make one shape of an archive; its voxels stay where they are, the surface is centred on them."""
+    """Make one shape of an archive; its voxels follow the surface where that is moved by half a voxel or more."""
     vertices = meshes[f"{name}_v"].astype(np.float64)
     faces = meshes[f"{name}_f"].astype(np.int64)
     solid = GridSolid(packed, ARCHIVE_VOXELS)
@@ -314,4 +195,9 @@ def _archive_shape(
     missed = np.inf if len(vertices) == 0 else np.abs(np.stack([vertices.min(0), vertices.max(0)]) - box).max()
     if missed > BOX_TOLERANCE:
         vertices, faces = voxels_to_mesh(solid.fill(ARCHIVE_VOXELS))
+    if len(vertices):
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        centre, scale = 0.5 * (low + high), float(np.linalg.norm(high - low))
+        if max(np.abs(centre).max(), abs(scale - 1.0)) > 0.5 / ARCHIVE_VOXELS:
+            solid = GridSolid(packed, ARCHIVE_VOXELS, (float(centre[0]), float(centre[1]), float(centre[2])), scale)
     return mesh_to_shape(info["category"], name, vertices, faces, None, diagonals, solid=solid, file=f"{file}[{name}]")

@@ -48,9 +48,7 @@ def unpack_voxels(packed: UInt8[np.ndarray, "*batch bytes"], n: int) -> Bool[np.
     return np.unpackbits(packed, axis=-1, count=n**3).astype(bool).reshape(*packed.shape[:-1], n, n, n)
 
 
-def voxel_iou(
-    a: Bool[np.ndarray, "*batch n n n"], b: Bool[np.ndarray, "*batch n n n"]
-) -> Float[np.ndarray, "*batch"]:
+def voxel_iou(a: Bool[np.ndarray, "*batch n n n"], b: Bool[np.ndarray, "*batch n n n"]) -> Float[np.ndarray, "*batch"]:
     """Intersection over union of paired grids (broadcast); two empty grids agree: 1.
 
     Raises:
@@ -97,19 +95,32 @@ def voxels_to_mesh(
     return (vertices.astype(np.float64) - 0.5) / n - 0.5, faces.astype(np.int64)
 
 
-def reduce_voxels(grid: Bool[np.ndarray, "m m m"], n: int, share: float = 0.25) -> Bool[np.ndarray, "{n} {n} {n}"]:
+def reduce_voxels(
+    grid: Bool[np.ndarray, "m m m"],
+    n: int,
+    share: float = 0.25,
+    centre: Float[np.ndarray, 3] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+) -> Bool[np.ndarray, "{n} {n} {n}"]:
     """Resample a grid to n^3: a voxel is filled when at least `share` of the samples in it are.
 
     At a quarter, rods and plates one fine voxel thick survive halving, and a solid's rounding is unbiased to half a
     fine voxel. Where n divides m the samples are the fine voxels themselves; n = m changes nothing.
+
+    Args:
+        grid: the fine grid, over [-0.5, 0.5]^3 of its own frame.
+        n: size of the result.
+        share: share of the samples, in (0, 1].
+        centre: where the result's origin lies in the frame of the grid.
+        scale: length of the result's unit in the frame of the grid.
     """
     m = grid.shape[0]
     per_axis = max(2, math.ceil(m / n))
-    ticks = (np.arange(n * per_axis) + 0.5) / (n * per_axis)
-    index = np.minimum((ticks * m).astype(np.int64), m - 1)
-    count = grid.astype(np.uint16)
+    ticks = voxel_centres(n * per_axis) * scale
+    count = np.pad(grid, 1).astype(np.uint16)  # what lies outside the grid is empty
     for axis in range(3):
-        fine = np.take(count, index, axis=axis)
+        index = np.clip(np.floor((ticks + centre[axis] + 0.5) * m).astype(np.int64), -1, m)
+        fine = np.take(count, index + 1, axis=axis)
         shape = list(fine.shape)
         shape[axis : axis + 1] = [n, per_axis]
         count = fine.reshape(shape).sum(axis=axis + 1)
@@ -164,12 +175,11 @@ def _surface_samples(triangles: Float[np.ndarray, "f 3 3"], spacing: float) -> I
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     height = np.linalg.norm(cross, axis=-1) / base
     # Powers of two keep the number of batches small.
-    cuts = np.stack([base, height], axis=-1) / spacing
-    cuts = 2 ** np.ceil(np.log2(np.maximum(cuts, 1.0))).astype(np.int64)
+    wanted = np.maximum(np.stack([base, height], axis=-1) / spacing, 1.0)
+    cuts = 2 ** np.ceil(np.log2(wanted)).astype(np.int64)
     kinds, kind = np.unique(cuts, axis=0, return_inverse=True)
     for i, (along, up) in enumerate(kinds):
-        s, t = np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(0, 1, up + 1))
-        s, t = s.ravel(), t.ravel()
+        s, t = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(0, 1, up + 1)))
         weights = np.stack([(1 - t) * (1 - s), (1 - t) * s, t], axis=-1)
         group = triangles[kind.reshape(-1) == i]
         step = max(1, 500_000 // len(weights))

@@ -8,7 +8,8 @@ from typing import Self
 
 import numpy as np
 
-from nolbo_ppl.data.shapes.primitives import Extrusion, Loft, Primitive, Torus, Tube
+from nolbo_ppl.data.shapes.primitives import Extrusion, Loft, Primitive
+from nolbo_ppl.data.shapes.tubes import Torus, Tube
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -133,24 +134,47 @@ class Builder:
         caps = (roles[0], roles[-1]) if caps is None else (caps, caps) if isinstance(caps, str) else caps
         polygon = None if section is None else np.asarray(section, dtype=np.float64)
         return self._add(
-            Loft(axis, np.asarray(stations, dtype=np.float64), centres, halves, exponent, polygon, segments, roles, caps),
+            Loft(
+                axis, np.asarray(stations, dtype=np.float64), centres, halves, exponent, polygon, segments, roles, caps
+            ),
             decal,
         )
 
     def cylinder(
-        self, axis: int, role: str, centre: Triple, radius: float, half_length: float, *,
-        caps: str | tuple[str, str] | None = None, segments: int = 14, decal: bool = False,
+        self,
+        axis: int,
+        role: str,
+        centre: Triple,
+        radius: float,
+        half_length: float,
+        *,
+        caps: str | tuple[str, str] | None = None,
+        segments: int = 14,
+        decal: bool = False,
     ) -> Self:
         """Add a cylinder along an axis."""
         u = centre[axis]
         plane = tuple(c for i, c in enumerate(centre) if i != axis)
         return self.loft(
-            axis, role, (u - half_length, u + half_length), (plane[0], plane[1]), (radius, radius),
-            caps=caps, segments=segments, decal=decal,
+            axis,
+            role,
+            (u - half_length, u + half_length),
+            (plane[0], plane[1]),
+            (radius, radius),
+            caps=caps,
+            segments=segments,
+            decal=decal,
         )
 
     def ellipsoid(
-        self, role: str, centre: Triple, half: Triple, *, exponent: float = 2.0, segments: int = 10, axis: int = 1,
+        self,
+        role: str,
+        centre: Triple,
+        half: Triple,
+        *,
+        exponent: float = 2.0,
+        segments: int = 10,
+        axis: int = 1,
         decal: bool = False,
     ) -> Self:
         """Add an ellipsoid (of seven sections along `axis`); a larger exponent makes its sections boxier."""
@@ -158,12 +182,23 @@ class Builder:
         plane = [i for i in range(3) if i != axis]
         halves = [(half[plane[0]] * math.cos(a), half[plane[1]] * math.cos(a)) for a in angle]
         return self.loft(
-            axis, role, centre[axis] + half[axis] * np.sin(angle), (centre[plane[0]], centre[plane[1]]), halves,
-            exponent=exponent, segments=segments, decal=decal,
+            axis,
+            role,
+            [centre[axis] + half[axis] * math.sin(a) for a in angle],
+            (centre[plane[0]], centre[plane[1]]),
+            halves,
+            exponent=exponent,
+            segments=segments,
+            decal=decal,
         )
 
     def tube(
-        self, role: str, path: Sequence[Triple], radius: float | Sequence[float], *, segments: int = 6,
+        self,
+        role: str,
+        path: Sequence[Triple],
+        radius: float | Sequence[float],
+        *,
+        segments: int = 6,
         decal: bool = False,
     ) -> Self:
         """Add a round tube along a path."""

@@ -41,11 +41,21 @@ def _axles(b: Builder, d: Draw, half: float, ys: tuple[float, ...], radius: floa
 
 def _tail(b: Builder, d: Draw, rear: float, half: float, floor: float, height: float, window: bool) -> None:
     """Add the blind back: a small high window, the engine grille, red lamps."""
-    b.box("body2", (-half + 0.04, half - 0.04), (rear - 0.3, rear + PROUD), (floor + 0.1, floor + 0.62 * (height - floor)))
-    b.box("grille", (-half * 0.72, half * 0.72), (rear - 0.2, rear + 2 * PROUD), (floor + 0.35, floor + d(0.8, 1.1)), decal=True)
+    b.box(
+        "body2", (-half + 0.04, half - 0.04), (rear - 0.3, rear + PROUD), (floor + 0.1, floor + 0.62 * (height - floor))
+    )
+    b.box(
+        "grille",
+        (-half * 0.72, half * 0.72),
+        (rear - 0.2, rear + 2 * PROUD),
+        (floor + 0.35, floor + d(0.8, 1.1)),
+        decal=True,
+    )
     red_h = d(0.35, 0.8)
     b.pair("light_rear", (half - 0.34, half - 0.06), (rear - 0.2, rear + 2 * PROUD), (floor + 0.6, floor + 0.6 + red_h))
-    b.pair("light_rear", (half - 0.4, half - 0.06), (rear - 0.2, rear + PROUD), (height - 0.22, height - 0.1), decal=True)
+    b.pair(
+        "light_rear", (half - 0.4, half - 0.06), (rear - 0.2, rear + PROUD), (height - 0.22, height - 0.1), decal=True
+    )
     b.box("trim", (-half - 0.01, half + 0.01), (rear - 0.3, rear + 0.1), (floor - 0.04, floor + 0.3))
     if window:
         top = height - 0.3
@@ -77,19 +87,37 @@ def _box_bus(b: Builder, d: Draw, style: str) -> None:
     top = 2.35 if style == "double" else height - (0.55 if style == "coach" else d(0.3, 0.42))
     ratio = (top - sill) / (height - sill)
     y_top = front + rake * ratio
-    profile = [(front, floor), (front, sill), (y_top, top), (front + rake, height - 0.12), (front + rake + 0.3, height),
-               (rear - 0.15, height), (rear, height - 0.25), (rear, floor)]
+    profile = [
+        (front, floor),
+        (front, sill),
+        (y_top, top),
+        (front + rake, height - 0.12),
+        (front + rake + 0.3, height),
+        (rear - 0.15, height),
+        (rear, height - 0.25),
+        (rear, floor),
+    ]
     b.side(("body", "windscreen", "body", "body", "body", "body", "body", "body"), profile, half, caps="body")
     # Corner pillars frame the windscreen, and the display sits over it.
     b.tubes("body", [(half - 0.03, front - 0.01, sill), (half - 0.03, y_top - 0.01, top)], 0.09, segments=5)
     if style == "double":
         low, high = 2.75, height - 0.35
         at = [front + rake * (z - sill) / (height - sill) for z in (low, high)]
-        b.side("windscreen", [(at[0] - PROUD, low), (at[1] - PROUD, high), (at[1] + 0.2, high), (at[0] + 0.2, low)],
-               half - 0.12, decal=True)
+        b.side(
+            "windscreen",
+            [(at[0] - PROUD, low), (at[1] - PROUD, high), (at[1] + 0.2, high), (at[0] + 0.2, low)],
+            half - 0.12,
+            decal=True,
+        )
         b.box("display", (-half * 0.7, half * 0.7), (at[0] - 1.6 * PROUD, at[0] + 0.3), (2.4, 2.68), decal=True)
     elif style != "coach":
-        b.box("display", (-half * 0.75, half * 0.75), (y_top - PROUD, y_top + 0.4), (top + 0.05, height - 0.09), decal=True)
+        b.box(
+            "display",
+            (-half * 0.75, half * 0.75),
+            (y_top - PROUD, y_top + 0.4),
+            (top + 0.05, height - 0.09),
+            decal=True,
+        )
     _face(b, d, front, half, floor, sill)
     engine = rear - d(1.0, 1.8) * (0.5 if style == "mini" else 1.0)
     door = front + rake + d(1.2, 1.5)
@@ -106,11 +134,23 @@ def _box_bus(b: Builder, d: Draw, style: str) -> None:
     if style in ("city", "double") and d.chance(0.7):
         y = d(-0.05, 0.15) * length
         b.box("trim", (-half - 1.5 * PROUD, -half + 0.1), (y, y + 1.2), (floor + 0.1, top - 0.1), decal=True)
-    b.pair("body2", (half - 0.2, half + 0.8 * PROUD), (engine + 0.1, rear - 0.08), (floor + 0.1, height - 0.3), decal=True)
+    b.pair(
+        "body2", (half - 0.2, half + 0.8 * PROUD), (engine + 0.1, rear - 0.08), (floor + 0.1, height - 0.3), decal=True
+    )
     if d.chance(0.6):
-        b.pair("body2", (half - 0.2, half + 0.8 * PROUD), (door, engine), (floor + 0.1, floor + d(0.3, 0.6)), decal=True)
-    b.tubes("trim", [(half - 0.02, front + 0.3 * rake, top - 0.05), (half + 0.14, front - 0.35, top - 0.1),
-                     (half + 0.14, front - 0.38, top - 0.55)], [0.04, 0.05, 0.11], segments=5)
+        b.pair(
+            "body2", (half - 0.2, half + 0.8 * PROUD), (door, engine), (floor + 0.1, floor + d(0.3, 0.6)), decal=True
+        )
+    b.tubes(
+        "trim",
+        [
+            (half - 0.02, front + 0.3 * rake, top - 0.05),
+            (half + 0.14, front - 0.35, top - 0.1),
+            (half + 0.14, front - 0.38, top - 0.55),
+        ],
+        [0.04, 0.05, 0.11],
+        segments=5,
+    )
     if d.chance(0.7):
         y = d(-0.3, 0.2) * length
         b.box("body2", (-half * 0.7, half * 0.7), (y, y + d(1.2, 2.6)), (height - 0.05, height + d(0.15, 0.3)))
@@ -129,10 +169,27 @@ def _school(b: Builder, d: Draw) -> None:
     hood, cowl = floor + d(0.75, 0.95), front + d(1.2, 1.9)
     sill, top = hood + 0.12, height - d(0.32, 0.4)
     hood_half = half * d(0.68, 0.82)
-    b.side("body", [(front, floor), (front, hood - 0.18), (front + 0.2, hood - 0.04), (cowl + 0.1, hood + 0.04),
-                    (cowl + 0.1, floor)], hood_half)
-    cabin = [(cowl, floor), (cowl, sill), (cowl + 0.3, top), (cowl + 0.38, height - 0.1), (cowl + 0.7, height),
-             (rear - 0.1, height), (rear, height - 0.2), (rear, floor)]
+    b.side(
+        "body",
+        [
+            (front, floor),
+            (front, hood - 0.18),
+            (front + 0.2, hood - 0.04),
+            (cowl + 0.1, hood + 0.04),
+            (cowl + 0.1, floor),
+        ],
+        hood_half,
+    )
+    cabin = [
+        (cowl, floor),
+        (cowl, sill),
+        (cowl + 0.3, top),
+        (cowl + 0.38, height - 0.1),
+        (cowl + 0.7, height),
+        (rear - 0.1, height),
+        (rear, height - 0.2),
+        (rear, floor),
+    ]
     b.side(("body", "windscreen", "body", "body", "body", "body", "body", "body"), cabin, half, caps="body")
     b.tubes("body", [(half - 0.03, cowl - 0.01, sill), (half - 0.03, cowl + 0.29, top)], 0.08, segments=5)
     b.box("grille", (-hood_half * 0.6, hood_half * 0.6), (front - PROUD, front + 0.1), (floor + 0.25, hood - 0.2))
@@ -144,7 +201,15 @@ def _school(b: Builder, d: Draw) -> None:
     _row(b, d, half, (cowl + 1.2, blind), (sill + 0.1, top), d.integer(5, 9))
     b.pair("glass", (half - 0.1, half + PROUD), (cowl + 0.4, cowl + 1.1), (sill - 0.15, top), decal=True)
     b.pair("trim", (half - 0.1, half + PROUD), (cowl + 1.2, rear - 0.1), (sill - 0.25, sill - 0.12), decal=True)
-    b.tubes("trim", [(half * 0.9, cowl + 0.05, sill + 0.1), (half + 0.1, cowl - 0.5, sill + 0.2),
-                     (half + 0.1, cowl - 0.5, sill + 0.6)], [0.04, 0.05, 0.1], segments=5)
+    b.tubes(
+        "trim",
+        [
+            (half * 0.9, cowl + 0.05, sill + 0.1),
+            (half + 0.1, cowl - 0.5, sill + 0.2),
+            (half + 0.1, cowl - 0.5, sill + 0.6),
+        ],
+        [0.04, 0.05, 0.1],
+        segments=5,
+    )
     _tail(b, d, rear, half, floor, height, window=True)
     _axles(b, d, half, (front + d(0.7, 1.0), rear - d(2.0, 2.8)), radius)

@@ -8,22 +8,22 @@ from collections.abc import Callable
 import numpy as np
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.data.shapes import air, bus, cycles, furniture, household, rail, road, water
+from nolbo_ppl.data.shapes import air, bicycle, bus, household, motorbike, rail, road, seats, tables, water
 from nolbo_ppl.data.shapes.builder import Builder, Draw
 from nolbo_ppl.data.shapes.shape import Shape, assemble
 from nolbo_ppl.errors import input_error
 
 FAMILIES: dict[str, Callable[[Builder, Draw], int]] = {
     "aeroplane": air.aeroplane,
-    "bicycle": cycles.bicycle,
+    "bicycle": bicycle.bicycle,
     "boat": water.boat,
     "bottle": household.bottle,
     "bus": bus.bus,
     "car": road.car,
-    "chair": furniture.chair,
-    "diningtable": furniture.diningtable,
-    "motorbike": cycles.motorbike,
-    "sofa": furniture.sofa,
+    "chair": seats.chair,
+    "diningtable": tables.diningtable,
+    "motorbike": motorbike.motorbike,
+    "sofa": seats.sofa,
     "train": rail.train,
     "tvmonitor": household.tvmonitor,
 }

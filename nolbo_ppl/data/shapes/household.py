@@ -28,7 +28,16 @@ def bottle(b: Builder, d: Draw) -> int:
     fill = d(0.55, 1.0) * z_shoulder
     wall = "bottle" if style != "jug" or d.chance(0.5) else "plastic"
     below = "liquid" if wall == "bottle" and d.chance(0.5) else wall
-    stations = (0.0, 0.02 * height, 0.5 * z_shoulder, fill, z_shoulder, z_shoulder + 0.45 * (z_neck - z_shoulder), z_neck, body)
+    stations = (
+        0.0,
+        0.02 * height,
+        0.5 * z_shoulder,
+        fill,
+        z_shoulder,
+        z_shoulder + 0.45 * (z_neck - z_shoulder),
+        z_neck,
+        body,
+    )
     fill_r = 1.0 + (waist - 1.0) * (z_shoulder - fill) / (0.5 * z_shoulder)
     radii = (0.9 * radius, radius, waist * radius, fill_r * radius, radius, radius * d(0.8, 0.93), neck * 1.1, neck)
     if exponent > 2:
@@ -74,23 +83,47 @@ def tvmonitor(b: Builder, d: Draw) -> int:
     deep = d(0.03, 0.07) if style == "flat" else d(0.03, 0.08)
     a, c = d(0.45, 0.8), d(0.3, 0.7)
     mid = z0 + d(0.35, 0.5) * (z1 - z0)
-    b.loft(1, "trim" if d.chance(0.4) else back, (0.4 * thick, 0.5 * thick + deep), [(0, mid), (0, mid)], [(w * (a + 0.12), h * (c + 0.12)), (w * a, h * c)],
-           section=((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    b.loft(
+        1,
+        "trim" if d.chance(0.4) else back,
+        (0.4 * thick, 0.5 * thick + deep),
+        [(0, mid), (0, mid)],
+        [(w * (a + 0.12), h * (c + 0.12)), (w * a, h * c)],
+        section=((-1, -1), (1, -1), (1, 1), (-1, 1)),
+    )
     y = 0.5 * thick + deep
     for i in range(4):
         z = mid + h * c * (0.1 + 0.2 * i)
         b.box("grille", (-w * a * 0.75, w * a * 0.75), (y - 0.01, y + proud), (z, z + 0.11 * h * c), decal=True)
-    b.box("label", (-w * a * 0.5, w * a * 0.1), (y - 0.01, y + proud), (mid - 0.6 * h * c, mid - 0.25 * h * c), decal=True)
-    b.box("light_front", (w * 0.82, w * 0.87), (-0.5 * thick - proud, 0), (z0 + 0.3 * bezel + 0.2 * chin, z0 + 0.7 * bezel + 0.4 * chin), decal=True)
+    b.box(
+        "label", (-w * a * 0.5, w * a * 0.1), (y - 0.01, y + proud), (mid - 0.6 * h * c, mid - 0.25 * h * c), decal=True
+    )
+    b.box(
+        "light_front",
+        (w * 0.82, w * 0.87),
+        (-0.5 * thick - proud, 0),
+        (z0 + 0.3 * bezel + 0.2 * chin, z0 + 0.7 * bezel + 0.4 * chin),
+        decal=True,
+    )
     reach = d(0.1, 0.16) if style == "flat" else d(0.08, 0.13)
     if style == "flat" and d.chance(0.5):
         x = w * d(0.5, 0.85)
         for sign in (-1.0, 1.0):
-            b.tube("metal", [(sign * x, -reach, 0.006), (sign * x, 0, foot_h + 0.02), (sign * x, reach, 0.006)], 0.01, segments=4)
+            b.tube(
+                "metal",
+                [(sign * x, -reach, 0.006), (sign * x, 0, foot_h + 0.02), (sign * x, reach, 0.006)],
+                0.01,
+                segments=4,
+            )
         return 1
     stem = d(0.025, 0.07)
     y_stem = 0.5 * thick + 0.3 * deep
-    b.box("metal" if case == "metal" else "plastic", (-stem, stem), (y_stem - 0.012, y_stem + 0.025), (0.008, z0 + 0.4 * h))
+    b.box(
+        "metal" if case == "metal" else "plastic",
+        (-stem, stem),
+        (y_stem - 0.012, y_stem + 0.025),
+        (0.008, z0 + 0.4 * h),
+    )
     if d.chance(0.5):
         b.box("metal" if case == "metal" else "trim", (-w * d(0.35, 0.6), w * 0.45), (-reach, reach * 0.8), (0, 0.014))
     else:
@@ -113,16 +146,35 @@ def _crt(b: Builder, d: Draw) -> None:
     b.box("screen", (-w + 0.07 * w, w - side), (y0 - 2 * proud, y0 + 0.02), (chin + 0.04 * h, 1.93 * h), decal=True)
     for i in range(d.integer(2, 5)):
         x = w * (0.75 - 0.18 * i)
-        b.box("grille", (x - 0.05 * w, x + 0.05 * w), (y0 - proud, y0 + 0.02), (0.3 * chin, 0.3 * chin + 0.08 * h), decal=True)
+        b.box(
+            "grille",
+            (x - 0.05 * w, x + 0.05 * w),
+            (y0 - proud, y0 + 0.02),
+            (0.3 * chin, 0.3 * chin + 0.08 * h),
+            decal=True,
+        )
     shrink, drop = d(0.45, 0.65), d(0.0, 0.12) * h
     yb, ye = y0 + front, y0 + deep
     ym = yb + d(0.35, 0.6) * (ye - yb)
-    b.loft(1, "plastic" if case != "plastic" else "body2", (yb - 0.01, ym, ye), [(0, z), (0, z - drop), (0, z - 1.5 * drop)],
-           [(0.96 * w, 0.95 * h), (0.82 * w, 0.78 * h), (shrink * w, shrink * h)], exponent=7, segments=12)
+    b.loft(
+        1,
+        "plastic" if case != "plastic" else "body2",
+        (yb - 0.01, ym, ye),
+        [(0, z), (0, z - drop), (0, z - 1.5 * drop)],
+        [(0.96 * w, 0.95 * h), (0.82 * w, 0.78 * h), (shrink * w, shrink * h)],
+        exponent=7,
+        segments=12,
+    )
     zc = z - 1.5 * drop
     for i in range(4):
         zz = zc + shrink * h * (-0.5 + 0.32 * i)
-        b.box("grille", (-0.7 * shrink * w, 0.7 * shrink * w), (ye - 0.02, ye + proud), (zz, zz + 0.12 * shrink * h), decal=True)
+        b.box(
+            "grille",
+            (-0.7 * shrink * w, 0.7 * shrink * w),
+            (ye - 0.02, ye + proud),
+            (zz, zz + 0.12 * shrink * h),
+            decal=True,
+        )
     b.pair("trim", (0.5 * w, 0.9 * w), (y0 + 0.01, ye - 0.1 * deep), (-0.006, 0.1 * h))
     if d.chance(0.25):
         b.tubes("metal", [(0.02, ym, 1.7 * h), (w * d(0.4, 0.9), ym, 2 * h + d(0.2, 0.4))], 0.006, segments=4)

@@ -63,9 +63,7 @@ def triangulate(polygon: Points) -> list[tuple[int, int, int]]:
             a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
             if turn(a, b, c) <= 1e-14:
                 continue
-            if all(
-                turn(a, b, p) < 0 or turn(b, c, p) < 0 or turn(c, a, p) < 0 for p in left if p not in (a, b, c)
-            ):
+            if all(turn(a, b, p) < 0 or turn(b, c, p) < 0 or turn(c, a, p) < 0 for p in left if p not in (a, b, c)):
                 triangles.append((a, b, c))
                 del left[k]
                 break

@@ -39,7 +39,8 @@ class Primitive(Protocol):
         """Which points of the grid x by y by z it holds, tested at least `thin` thick to each side."""
 
 
-def _to_world(axis: int, u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+def to_world(axis: int, u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Points [n, 3] from coordinates along `axis` and in the plane across it."""
     points = np.empty((len(u), 3))
     points[:, axis] = u
     points[:, PLANE_AXES[axis][0]] = v
@@ -47,13 +48,13 @@ def _to_world(axis: int, u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndar
     return points
 
 
-def _from_plane(axis: int, grid_uvw: np.ndarray) -> np.ndarray:
+def from_plane(axis: int, grid_uvw: np.ndarray) -> np.ndarray:
     """Reorder an array indexed [u, v, w] to [x, y, z]."""
     return grid_uvw if axis == 0 else grid_uvw.transpose(1, 0, 2) if axis == 1 else grid_uvw.transpose(1, 2, 0)
 
 
 @lru_cache(maxsize=256)
-def _rings_to_faces(rings: int, segments: int, capped: bool) -> np.ndarray:
+def rings_to_faces(rings: int, segments: int, capped: bool) -> np.ndarray:
     """Faces [f, 3] between consecutive rings of `segments` vertices each, band by band, outside to the right.
 
     `capped` closes the ends by two fans; otherwise the last ring is joined to the first.
@@ -128,15 +129,13 @@ class Extrusion:
         """The least and the greatest corner of its box."""
         (v0, w0), (v1, w1) = self.profile.min(0), self.profile.max(0)
         u = np.array([self._plane(self.low).min(), self._plane(self.high).max()])
-        return _to_world(self.axis, u, np.array([v0, v1]), np.array([w0, w1]))
+        return to_world(self.axis, u, np.array([v0, v1]), np.array([w0, w1]))
 
     def mesh(self) -> Mesh:
         """Two caps and a quadrilateral per edge."""
         n = len(self.profile)
         v, w = self.profile.T
-        vertices = np.concatenate(
-            [_to_world(self.axis, self._plane(plane), v, w) for plane in (self.low, self.high)]
-        )
+        vertices = np.concatenate([to_world(self.axis, self._plane(plane), v, w) for plane in (self.low, self.high)])
         caps = np.array(triangulate(self.profile))
         faces = np.concatenate([caps[:, ::-1], caps + n, _prism_sides(n)])
         names = [self.cap_roles[0]] * len(caps) + [self.cap_roles[1]] * len(caps)
@@ -157,7 +156,7 @@ class Extrusion:
         low, high = (p[0] + p[1] * v[:, None] + p[2] * w[None, :] for p in (self.low, self.high))
         extra = np.maximum(thin - 0.5 * (high - low), 0.0)
         inside = (u[:, None, None] >= low - extra) & (u[:, None, None] <= high + extra) & mask
-        return _from_plane(self.axis, inside)
+        return from_plane(self.axis, inside)
 
 
 @dataclass(frozen=True)
@@ -198,15 +197,15 @@ class Loft:
         """The least and the greatest corner of its box."""
         low, high = (self.centre - self.half).min(0), (self.centre + self.half).max(0)
         u = self.stations[[0, -1]]
-        return _to_world(self.axis, u, np.array([low[0], high[0]]), np.array([low[1], high[1]]))
+        return to_world(self.axis, u, np.array([low[0], high[0]]), np.array([low[1], high[1]]))
 
     def mesh(self) -> Mesh:
         """Rings joined by quadrilaterals, and two caps."""
         ring = self._ring()
         k, n = len(self.stations), len(ring)
         plane = (self.centre[:, None] + self.half[:, None] * ring).reshape(-1, 2)
-        vertices = _to_world(self.axis, np.repeat(self.stations, n), plane[:, 0], plane[:, 1])
-        faces = _rings_to_faces(k, n, capped=True)
+        vertices = to_world(self.axis, np.repeat(self.stations, n), plane[:, 0], plane[:, 1])
+        faces = rings_to_faces(k, n, capped=True)
         names = [role for role in self.roles for _ in range(2 * n)]
         names += [self.cap_roles[0]] * (n - 2) + [self.cap_roles[1]] * (n - 2)
         return vertices, faces[:, ::-1] if self.axis == 1 else faces, names
@@ -230,121 +229,4 @@ class Loft:
             inside = np.ones((len(u), len(v), len(w)), dtype=bool)
             for (p, q), (dp, dq) in zip(ring, edge):
                 inside &= ((a - p) * dq)[:, :, None] <= ((b - q) * dp)[:, None, :]
-        return _from_plane(self.axis, inside & within[:, None, None])
-
-
-@dataclass(frozen=True)
-class Tube:
-    """A round tube along a path, with a radius at each point (straight in between) and flat ends.
-
-    Attributes:
-        path: points [k, 3].
-        radius: radii [k].
-        role: its role.
-        segments: corners of a ring of the mesh.
-    """
-
-    path: Float[np.ndarray, "k 3"]
-    radius: Float[np.ndarray, " k"]
-    role: str
-    segments: int = 6
-
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """The least and the greatest corner of its box (flat ends are given their radius too: never too small)."""
-        return np.stack([(self.path - self.radius[:, None]).min(0), (self.path + self.radius[:, None]).max(0)])
-
-    def mesh(self) -> Mesh:
-        """Rings carried along the path without twist, and two caps."""
-        step = np.diff(self.path, axis=0)
-        step /= np.sqrt((step**2).sum(-1, keepdims=True))
-        tangent = np.concatenate([step[:1], step[:-1] + step[1:], step[-1:]])
-        length = np.sqrt((tangent**2).sum(-1, keepdims=True))
-        tangent /= length
-        # A mitred joint is wider than the tube by 1 / cos(half the bend): |t_1 + t_2| = 2 cos(half the bend).
-        mitre = np.where(np.arange(len(tangent)) % (len(tangent) - 1) == 0, 1.0, 2.0 / np.maximum(length[:, 0], 1.0))
-        side = np.eye(3)[np.argmin(np.abs(tangent[0]))]
-        angle = np.arange(self.segments) * (2 * math.pi / self.segments)
-        rings = []
-        for point, t, r in zip(self.path, tangent, self.radius * mitre):
-            side = side - (side @ t) * t
-            side /= math.sqrt(side @ side)
-            up = np.array(
-                [t[1] * side[2] - t[2] * side[1], t[2] * side[0] - t[0] * side[2], t[0] * side[1] - t[1] * side[0]]
-            )
-            rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up))
-        k, n = len(self.path), self.segments
-        faces = _rings_to_faces(k, n, capped=True)
-        return np.concatenate(rings), faces, [self.role] * len(faces)
-
-    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
-        """Distance to each straight piece; joints are round, ends flat."""
-        result = np.zeros((len(x), len(y), len(z)), dtype=bool)
-        last = len(self.path) - 2
-        for i in range(last + 1):
-            a, b = self.path[i].tolist(), self.path[i + 1].tolist()
-            r0, r1 = max(float(self.radius[i]), thin), max(float(self.radius[i + 1]), thin)
-            pad = max(r0, r1)
-            window = tuple(
-                slice(*np.searchsorted(axis, (min(p, q) - pad, max(p, q) + pad))) for axis, p, q in zip((x, y, z), a, b)
-            )
-            dx, dy, dz = x[window[0]] - a[0], y[window[1]] - a[1], z[window[2]] - a[2]
-            ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-            square = ex * ex + ey * ey + ez * ez
-            along = ((dx * (ex / square))[:, None] + dy * (ey / square))[:, :, None] + dz * (ez / square)
-            near = np.clip(along, 0.0, 1.0)
-            # |d - near e|^2 = |d|^2 - (2 along - near) near |e|^2
-            distance = ((dx * dx)[:, None] + dy * dy)[:, :, None] + dz * dz - (2 * along - near) * near * square
-            hit = distance <= (r0 + near * (r1 - r0)) ** 2
-            overhang = max(thin / math.sqrt(square) - 0.5, 0.0) if last == 0 else 0.0
-            if i == 0:
-                hit &= along >= -overhang
-            if i == last:
-                hit &= along <= 1.0 + overhang
-            result[window] |= hit
-        return result
-
-
-@dataclass(frozen=True)
-class Torus:
-    """A ring around an axis: tyres.
-
-    Attributes:
-        axis: the axis it turns about.
-        centre: its centre [3].
-        ring: radius of the circle in its middle.
-        tube: radius across it.
-        role: its role.
-        segments: corners around the axis and around the tube.
-    """
-
-    axis: int
-    centre: tuple[float, float, float]
-    ring: float
-    tube: float
-    role: str
-    segments: tuple[int, int] = (16, 5)
-
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """The least and the greatest corner of its box."""
-        half = np.full(3, self.ring + self.tube)
-        half[self.axis] = self.tube
-        return np.array([self.centre - half, self.centre + half])
-
-    def mesh(self) -> Mesh:
-        """Rings of the tube around the axis."""
-        n, m = self.segments
-        around, across = np.meshgrid(np.arange(n) * 2 * math.pi / n, np.arange(m) * 2 * math.pi / m, indexing="ij")
-        radius = (self.ring + self.tube * np.cos(across)).ravel()
-        v, w = radius * np.cos(around.ravel()), radius * np.sin(around.ravel())
-        vertices = _to_world(self.axis, self.tube * np.sin(across.ravel()), v, w) + np.array(self.centre)
-        faces = _rings_to_faces(n, m, capped=False)
-        return vertices, faces if self.axis == 1 else faces[:, ::-1], [self.role] * len(faces)
-
-    def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
-        """(distance from the axis - ring)^2 + height^2 <= tube^2, the first part on the plane alone."""
-        grid = [axis - c for axis, c in zip((x, y, z), self.centre)]
-        u = grid[self.axis]
-        v, w = (grid[i] for i in PLANE_AXES[self.axis])
-        plane = (np.sqrt(v[:, None] ** 2 + w[None, :] ** 2) - self.ring) ** 2
-        tube = max(self.tube, thin)
-        return _from_plane(self.axis, plane <= (tube * tube - u * u)[:, None, None])
+        return from_plane(self.axis, inside & within[:, None, None])

@@ -61,8 +61,17 @@ def _saloon(b: Builder, d: Draw, style: str) -> None:
     half, front, rear = 0.5 * width, -0.5 * length, 0.5 * length
     belt = ground + (height - ground) * d(0.5, 0.6)
     nose = ground + (belt - ground) * d(0.62, 0.9)
-    bonnet = length * {"sedan": d(0.24, 0.3), "coupe": d(0.28, 0.4), "hatchback": d(0.16, 0.25),
-                       "estate": d(0.22, 0.28), "suv": d(0.2, 0.28), "pickup": d(0.22, 0.28)}[style]
+    bonnet = (
+        length
+        * {
+            "sedan": d(0.24, 0.3),
+            "coupe": d(0.28, 0.4),
+            "hatchback": d(0.16, 0.25),
+            "estate": d(0.22, 0.28),
+            "suv": d(0.2, 0.28),
+            "pickup": d(0.22, 0.28),
+        }[style]
+    )
     cowl = front + bonnet
     rake = (height - belt) * (d(0.45, 0.8) if style == "suv" else d(0.9, 1.6))
     if style in ("sedan", "coupe"):
@@ -75,8 +84,16 @@ def _saloon(b: Builder, d: Draw, style: str) -> None:
     boot = belt - d(0.0, 0.08) if style in ("sedan", "coupe") else belt
     bed = style == "pickup"
     deck = ground + 0.45 * (belt - ground) if bed else boot
-    lower = [(front, ground), (front, nose), (front + 0.25 * bonnet, nose + 0.5 * (belt - nose)), (cowl, belt),
-             (foot, belt), (foot + 0.01, deck), (rear, deck), (rear, ground)]
+    lower = [
+        (front, ground),
+        (front, nose),
+        (front + 0.25 * bonnet, nose + 0.5 * (belt - nose)),
+        (cowl, belt),
+        (foot, belt),
+        (foot + 0.01, deck),
+        (rear, deck),
+        (rear, ground),
+    ]
     b.side("body", lower, (half + 0.04 * belt, 0.0, -0.04))
     if bed:
         wall = d(0.07, 0.1)
@@ -90,8 +107,13 @@ def _saloon(b: Builder, d: Draw, style: str) -> None:
     glass = (belt_half - slope * belt, 0.0, slope)
     top_front, top_rear = cowl + rake, foot - back_rake
     crown = 0.5 * (top_front + top_rear)
-    cabin = [(cowl, belt - 0.02), (top_front, height - 0.04), (crown, height), (top_rear, height - 0.05),
-             (foot - 0.005, belt - 0.02)]
+    cabin = [
+        (cowl, belt - 0.02),
+        (top_front, height - 0.04),
+        (crown, height),
+        (top_rear, height - 0.05),
+        (foot - 0.005, belt - 0.02),
+    ]
     roof = "body2" if d.chance(0.15) else "body"
     b.side(("windscreen", roof, roof, "glass", "body"), cabin, glass, caps="glass")
     bar = 0.045
@@ -99,19 +121,35 @@ def _saloon(b: Builder, d: Draw, style: str) -> None:
     def on_glass(y: float, z: float) -> tuple[float, float, float]:
         return (glass[0] + glass[2] * z, y, z)
 
-    b.tubes("body", [on_glass(cowl, belt), on_glass(top_front, height - 0.04), on_glass(crown, height - 0.01),
-                     on_glass(top_rear, height - 0.05), on_glass(foot, belt)], bar, segments=5)
+    b.tubes(
+        "body",
+        [
+            on_glass(cowl, belt),
+            on_glass(top_front, height - 0.04),
+            on_glass(crown, height - 0.01),
+            on_glass(top_rear, height - 0.05),
+            on_glass(foot, belt),
+        ],
+        bar,
+        segments=5,
+    )
     doors = 1 if style in ("coupe", "pickup") else 2
     for i in range(doors):
         y = cowl + rake * 0.7 + (foot - back_rake * 0.6 - cowl - rake * 0.7) * (i + 1) / (doors + 1)
         b.tubes("body", [on_glass(y, belt), on_glass(y + 0.05, height - 0.03)], bar, segments=5)
-    _lamps(b, d, front, rear, half - 0.02, nose, belt if bed or style in ("hatchback", "estate", "suv") else boot, ground)
+    _lamps(
+        b, d, front, rear, half - 0.02, nose, belt if bed or style in ("hatchback", "estate", "suv") else boot, ground
+    )
     overhang = length * d(0.15, 0.19)
     _wheels(b, d, front + overhang, rear - length * d(0.16, 0.22), half, radius)
     _mirrors(b, cowl + 0.35 * rake, belt + 0.02, half)
     if style in ("suv", "estate") and d.chance(0.6):
-        b.tubes("trim", [(roof_half * 0.9, top_front + 0.1, height + 0.05), (roof_half * 0.9, top_rear - 0.1, height + 0.04)],
-                0.03, segments=4)
+        b.tubes(
+            "trim",
+            [(roof_half * 0.9, top_front + 0.1, height + 0.05), (roof_half * 0.9, top_rear - 0.1, height + 0.04)],
+            0.03,
+            segments=4,
+        )
     if style == "suv" and d.chance(0.35):
         b.cylinder(1, "tyre", (d(-0.2, 0.2), rear + 0.1, 0.5 * (ground + belt) + 0.1), radius * 0.95, 0.12, caps="trim")
     if style == "coupe" and d.chance(0.5):
@@ -130,8 +168,16 @@ def _van(b: Builder, d: Draw) -> None:
     top_y = cowl_y + d(0.45, 1.0)
     taper = 0.05
     body = (half + taper * ground, 0.0, -taper)
-    profile = [(front, ground), (front, nose), (cowl_y, cowl_z), (top_y, height - 0.06), (top_y + 0.4, height),
-               (rear - 0.05, height), (rear, cowl_z), (rear, ground)]
+    profile = [
+        (front, ground),
+        (front, nose),
+        (cowl_y, cowl_z),
+        (top_y, height - 0.06),
+        (top_y + 0.4, height),
+        (rear - 0.05, height),
+        (rear, cowl_z),
+        (rear, ground),
+    ]
     b.side(("body", "body", "windscreen", "body", "body", "body", "body", "body"), profile, body, caps="body")
     proud = (body[0] + PROUD, 0.0, -taper)
     low, high = cowl_z + 0.05, min(cowl_z + d(0.55, 0.8), height - 0.15)
@@ -145,8 +191,12 @@ def _van(b: Builder, d: Draw) -> None:
             y0 = door + 0.12 + i * span
             b.side("glass", [(y0, low), (y0, high), (y0 + span - 0.1, high), (y0 + span - 0.1, low)], proud, decal=True)
     else:
-        b.side("body2", [(door + 0.2, low - 0.35), (door + 0.2, low - 0.15), (rear - 0.1, low - 0.15), (rear - 0.1, low - 0.35)],
-               proud, decal=True)
+        b.side(
+            "body2",
+            [(door + 0.2, low - 0.35), (door + 0.2, low - 0.15), (rear - 0.1, low - 0.15), (rear - 0.1, low - 0.35)],
+            proud,
+            decal=True,
+        )
     b.pair("glass", (0.05, half * 0.72), (rear - 0.2, rear + PROUD), (low + 0.1, high - 0.05), decal=True)
     b.box("trim", (-0.02, 0.02), (rear - 0.2, rear + PROUD), (ground + 0.1, height - 0.1), decal=True)
     _lamps(b, d, front, rear, half - 0.04, nose, cowl_z - 0.02, ground)

@@ -68,7 +68,7 @@ class AnalyticSolid:
     """
 
     primitives: tuple[Primitive, ...]
-    centre: Float[np.ndarray, "3"]
+    centre: Float[np.ndarray, 3]
     diagonal: float
 
     @cached_property
@@ -88,7 +88,9 @@ class AnalyticSolid:
         grid = np.zeros((n, n, n), dtype=bool)
         for primitive, (low, high) in zip(self.primitives, self._bounds):
             window = tuple(
-                slice(max(int((low[i] - thin - first[i]) / step), 0), max(int((high[i] + thin - first[i]) / step) + 1, 0))
+                slice(
+                    max(int((low[i] - thin - first[i]) / step), 0), max(int((high[i] + thin - first[i]) / step) + 1, 0)
+                )
                 for i in range(3)
             )
             grid[window] |= primitive.inside(axes[0][window[0]], axes[1][window[1]], axes[2][window[2]], thin)
@@ -132,7 +134,7 @@ class Shape:
         return self.solid.fill(n)
 
     @property
-    def dimensions(self) -> Float[np.ndarray, "3"]:
+    def dimensions(self) -> Float[np.ndarray, 3]:
         """Side lengths of the box along x, y and z in metres."""
         return (self.vertices.max(axis=0) - self.vertices.min(axis=0)) * self.diagonal
 

@@ -1,4 +1,4 @@
-"""Chairs, sofas and dining tables. Lengths in metres, the front at -y: whoever sits looks to -y."""
+"""Chairs and sofas. Lengths in metres, the front at -y: whoever sits looks to -y."""
 
 from __future__ import annotations
 
@@ -31,9 +31,21 @@ def chair(b: Builder, d: Draw) -> int:
     elif style == "cantilever":
         frame = "metal"
         x = half - 0.02
-        b.tubes("metal", [(x, rear, 0.015), (x, front + 0.02, 0.015), (x, front, 0.06), (x, front, seat - 0.05),
-                          (x, front + 0.04, seat - 0.01), (x, rear, seat - 0.01), (x, rear + 0.04, seat + 0.06),
-                          (x, rear + lean + 0.03, top)], 0.014, segments=5)
+        b.tubes(
+            "metal",
+            [
+                (x, rear, 0.015),
+                (x, front + 0.02, 0.015),
+                (x, front, 0.06),
+                (x, front, seat - 0.05),
+                (x, front + 0.04, seat - 0.01),
+                (x, rear, seat - 0.01),
+                (x, rear + 0.04, seat + 0.06),
+                (x, rear + lean + 0.03, top),
+            ],
+            0.014,
+            segments=5,
+        )
         b.box("metal", (-x, x), (rear - 0.012, rear + 0.012), (0.004, 0.028))
     else:
         _legs(b, d, half, front, rear, seat - thick, frame, splay=d(0.0, 0.06), square=d.chance(0.5))
@@ -97,8 +109,8 @@ def _back(
         kind = "shell"
     else:
         low = seat - 0.04
-        weights = {"lounge": dict(shell=1.0), "cantilever": dict(shell=0.6, bar=0.4)}
-        kind = d.choice(**weights.get(style, dict(shell=0.34, spindles=0.26, ladder=0.24, bar=0.16)))
+        weights = {"lounge": {"shell": 1.0}, "cantilever": {"shell": 0.6, "bar": 0.4}}
+        kind = d.choice(**weights.get(style, {"shell": 0.34, "spindles": 0.26, "ladder": 0.24, "bar": 0.16}))
     if kind == "shell":
         width = half * d(0.8, 1.02)
         slab("body2", (-width, width), low, top, 0.0, thick)
@@ -117,7 +129,9 @@ def _back(
         count = d.integer(3, 6)
         for i in range(count):
             x = (half - 2 * post) * (2 * (i + 1) / (count + 1) - 1)
-            b.tube(frame, [(x, at(seat) + post, seat - 0.08), (x, at(top) + post, top - 0.03)], d(0.009, 0.016), segments=5)
+            b.tube(
+                frame, [(x, at(seat) + post, seat - 0.08), (x, at(top) + post, top - 0.03)], d(0.009, 0.016), segments=5
+            )
     elif kind == "ladder":
         count = d.integer(2, 4)
         for i in range(count):
@@ -127,9 +141,7 @@ def _back(
         slab("cushion", (-half + 0.03, half - 0.03), top - rail - 0.05, top - 0.01, -0.03, 0.005)
 
 
-def _arms(
-    b: Builder, d: Draw, half: float, front: float, rear: float, seat: float, frame: str, *, solid: bool
-) -> None:
+def _arms(b: Builder, d: Draw, half: float, front: float, rear: float, seat: float, frame: str, *, solid: bool) -> None:
     """Add arm rests: bars on posts, or upholstered sides."""
     z = seat + d(0.18, 0.26)
     if solid:
@@ -156,8 +168,13 @@ def sofa(b: Builder, d: Draw) -> int:
     b.box("fabric", (-half, half), (front + 0.03, rear - 0.02), (leg, leg + base))
     lean = d(0.0, 0.12)
     # The back slopes; its rear face is plain and in the second tone.
-    profile = [(rear - back_t, leg + 0.02), (rear - back_t + 0.3 * lean, back - 0.03), (rear - 0.25 * back_t + lean, back),
-               (rear + lean, back - 0.04), (rear, leg + 0.02)]
+    profile = [
+        (rear - back_t, leg + 0.02),
+        (rear - back_t + 0.3 * lean, back - 0.03),
+        (rear - 0.25 * back_t + lean, back),
+        (rear + lean, back - 0.04),
+        (rear, leg + 0.02),
+    ]
     b.extrude(0, ("fabric", "fabric", "fabric", "body2", "fabric"), profile, -outer + 0.01, outer - 0.01)
     if arms == "box":
         b.pair("fabric", (half, outer), (front, rear - 0.03), (leg + 0.01, arm_z))
@@ -165,11 +182,23 @@ def sofa(b: Builder, d: Draw) -> int:
         r = 0.5 * arm_w + 0.03
         b.pair("fabric", (half, outer - 0.02), (front + 0.02, rear - 0.03), (leg + 0.01, arm_z - r))
         for sign in (-1.0, 1.0):
-            b.cylinder(1, "fabric", (sign * (half + 0.5 * arm_w), 0.5 * (front + rear) - 0.01, arm_z - r), r, 0.5 * depth - 0.02,
-                       segments=10, caps="body2")
+            b.cylinder(
+                1,
+                "fabric",
+                (sign * (half + 0.5 * arm_w), 0.5 * (front + rear) - 0.01, arm_z - r),
+                r,
+                0.5 * depth - 0.02,
+                segments=10,
+                caps="body2",
+            )
     elif arms == "slope":
-        side = [(front, leg + 0.01), (front + 0.04, arm_z - 0.1), (rear - 0.05, min(back - 0.06, arm_z + 0.12)), (rear - 0.05, leg + 0.01)]
-        b.extrude(0, "fabric", side, half, outer).extrude(0, "fabric", side, -outer, -half)
+        view = [
+            (front, leg + 0.01),
+            (front + 0.04, arm_z - 0.1),
+            (rear - 0.05, min(back - 0.06, arm_z + 0.12)),
+            (rear - 0.05, leg + 0.01),
+        ]
+        b.extrude(0, "fabric", view, half, outer).extrude(0, "fabric", view, -outer, -half)
     chaise = seats >= 2 and d.chance(0.2)
     side = -1.0 if d.chance(0.5) else 1.0
     pitch = width / seats
@@ -186,71 +215,32 @@ def sofa(b: Builder, d: Draw) -> int:
             b.box("fabric", (x0, x1), (fore + 0.03, front + 0.1), (leg, leg + base - 0.004))
         if pillows:
             y = rear - back_t
-            b.extrude(0, "cushion", [(y - pillow_t - 0.03, seat - 0.01), (y - 0.55 * pillow_t, min(seat + pillow_h, back + 0.1)),
-                                     (y + 0.03, min(seat + pillow_h, back + 0.1)), (y + 0.005, seat - 0.01)], x0 + 0.01, x1 - 0.01)
+            b.extrude(
+                0,
+                "cushion",
+                [
+                    (y - pillow_t - 0.03, seat - 0.01),
+                    (y - 0.55 * pillow_t, min(seat + pillow_h, back + 0.1)),
+                    (y + 0.03, min(seat + pillow_h, back + 0.1)),
+                    (y + 0.005, seat - 0.01),
+                ],
+                x0 + 0.01,
+                x1 - 0.01,
+            )
     if not pillows:
         rows = d.integer(2, 3)
         for i in range(2 * seats):
             for j in range(rows):
                 x = -half + width * (i + 0.5) / (2 * seats)
                 z = seat + (back - seat - 0.08) * (j + 0.7) / (rows + 0.4)
-                b.box("cushion", (x - 0.1 * pitch, x + 0.1 * pitch), (rear - back_t - 0.035, rear - 0.5 * back_t), (z - 0.06, z + 0.06))
+                b.box(
+                    "cushion",
+                    (x - 0.1 * pitch, x + 0.1 * pitch),
+                    (rear - back_t - 0.035, rear - 0.5 * back_t),
+                    (z - 0.06, z + 0.06),
+                )
     t = d(0.02, 0.04)
     foot = d.choice(wood=0.6, metal=0.4)
     for y in (front + 0.06, rear - 0.08):
         b.pair(foot, (outer - 0.1 - t, outer - 0.1 + t), (y - t, y + t), (0, leg + 0.03))
     return 1
-
-
-def diningtable(b: Builder, d: Draw) -> int:
-    """Add one table; returns its symmetry: 0 round on a round foot, 4 square or round on four legs, else 2."""
-    top = d.choice(rectangle=0.44, square=0.16, round=0.28, oval=0.12)
-    height, thick = d(0.68, 0.8), d(0.02, 0.06)
-    role = d.choice(wood=0.75, glass=0.12, plastic=0.13)
-    frame = d.choice(wood=0.6, metal=0.2, dark_metal=0.2) if role != "glass" else "metal"
-    long = d(0.6, 1.2) if top == "rectangle" else d(0.5, 0.9) if top == "oval" else d(0.38, 0.75)
-    deep = {"rectangle": d(0.36, 0.55), "oval": d(0.35, 0.5)}.get(top, long)
-    long = max(long, deep * 1.25) if top in ("rectangle", "oval") else long
-    z0 = height - thick
-    if top in ("rectangle", "square"):
-        b.box(role, (-long, long), (-deep, deep), (z0, height))
-    else:
-        b.loft(2, role, (z0, height), (0, 0), [(long, deep), (long, deep)], segments=24)
-    if top == "round" and d.chance(0.65):
-        _round_foot(b, d, long, z0, frame)
-        return 0
-    # A foot with more symmetry than the top leaves the top's; a four-legged round table has the legs' four turns.
-    order = 4 if top in ("square", "round") else 2
-    inset = d(0.03, 0.3 if order == 4 else 0.22)
-    x, y = (long, deep) if top in ("rectangle", "square") else (long * 0.68, deep * 0.68)
-    inset_y = inset if order == 4 else d(0.02, 0.1)
-    kind = d.choice(legs=0.62, taper=0.2, trestle=0.18 if order == 2 else 0.0)
-    t = d(0.02, 0.05)
-    px, py = x - inset * x - t, y - inset_y * y - t
-    if kind == "trestle":
-        b.pair(frame, (px - t, px + t), (-0.25 * y - t, 0.25 * y + t), (0.03, z0))
-        b.pair(frame, (px - 1.6 * t, px + 1.6 * t), (-py, py), (0, 0.07))
-        b.box(frame, (-px, px), (-t, t), (0.25 * height, 0.25 * height + 0.1))
-        return order
-    for sx in (-1.0, 1.0):
-        for sy in (-1.0, 1.0):
-            if kind == "legs":
-                b.box(frame, (sx * px - t, sx * px + t), (sy * py - t, sy * py + t), (0, z0))
-            else:
-                b.loft(2, frame, (0, z0), [(sx * (px + 0.5 * t), sy * (py + 0.5 * t)), (sx * px, sy * py)], [0.5 * t, 1.2 * t],
-                       section=((-1, -1), (1, -1), (1, 1), (-1, 1)))
-    if d.chance(0.6):
-        h = d(0.05, 0.12)
-        b.pair(frame, (px - 0.4 * t, px + 0.4 * t), (-py, py), (z0 - h, z0))
-        for sy in (-1.0, 1.0):
-            b.box(frame, (-px, px), (sy * py - 0.4 * t, sy * py + 0.4 * t), (z0 - h, z0))
-    return order
-
-
-def _round_foot(b: Builder, d: Draw, radius: float, z: float, frame: str) -> None:
-    """Add a turned column on a round plate."""
-    stem, foot = d(0.035, 0.1), radius * d(0.4, 0.75)
-    bulge, plate = d(1.0, 2.0), d(0.015, 0.05)
-    stations = (0.0, plate, plate + 0.05, 0.35 * z, 0.6 * z, z)
-    radii = (foot, foot * 0.95, min(2 * stem, foot * 0.9), stem * bulge, stem, stem * d(1.0, 2.5))
-    b.loft(2, frame, stations, (0, 0), radii, segments=16)
