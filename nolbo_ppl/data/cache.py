@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, UInt8
 from tqdm import tqdm
 
 from nolbo_ppl.categories import CATEGORIES
@@ -152,3 +152,15 @@ class CachedScenes:
             shard, within = divmod(int(index[row]), BLOCK)
             voxels[row, slot] = self._voxels[shard][self._voxel_row[shard][within, slot]]
         return assemble(images, labels, voxels, present.copy())
+
+    def shapes(self) -> tuple[Int[np.ndarray, " n"], UInt8[np.ndarray, "n bytes"], Int[np.ndarray, " n"]]:
+        """Number, packed voxels and category of every shape that occurs, each once, in the order of the numbers."""
+        number = self.labels["instance"][self.labels["present"]]
+        category = self.labels["category"][self.labels["present"]]
+        number, first = np.unique(number, return_index=True)
+        scene, slot = np.nonzero(self.labels["present"])
+        packed = np.empty((len(number), VOXELS**3 // 8), dtype=np.uint8)
+        for row, position in enumerate(first):
+            shard, within = divmod(int(scene[position]), BLOCK)
+            packed[row] = self._voxels[shard][self._voxel_row[shard][within, slot[position]]]
+        return number, packed, category[first]

@@ -195,3 +195,16 @@ class SceneFolder:
                 if bits is not None:
                     voxels[row, slot], has_voxels[row, slot] = bits, True
         return assemble(images, labels, voxels, has_voxels)
+
+    def shapes(self) -> tuple[Int[np.ndarray, " n"], UInt8[np.ndarray, "n bytes"], Int[np.ndarray, " n"]]:
+        """Number, packed voxels and category of every instance with known voxels and category, by ascending number."""
+        found: dict[int, tuple[np.ndarray, int]] = {}
+        for record in self.records:
+            for thing in record.objects:
+                bits = self._voxels.get(thing.instance or "")
+                number = self._number.get(thing.instance or "", -1)
+                if bits is not None and number >= 0 and thing.category is not None:
+                    found[number] = (bits, self.categories.index(thing.category))
+        number = np.array(sorted(found), dtype=np.int64)
+        packed = np.array([found[n][0] for n in sorted(found)], dtype=np.uint8).reshape(len(found), VOXELS**3 // 8)
+        return number, packed, np.array([found[n][1] for n in sorted(found)], dtype=np.int64)

@@ -1,0 +1,144 @@
+"""What the trainer asks for: the batch of a step, with the teacher's latents, augmented; and batches of shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from nolbo_ppl.data.arrays import Arrays
+from nolbo_ppl.data.augment import Augmentation, augment
+from nolbo_ppl.data.loader import Scenes, batch_indices
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.stages import seeded_noise
+from nolbo_ppl.models.nolbo import Nolbo
+from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.shape_vae import ShapeBatch
+
+
+def to_batch(arrays: Arrays) -> SceneBatch:
+    """Arrays of a loader as the batch that story and guide take."""
+    return SceneBatch(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()})
+
+
+class Part:
+    """Some scenes of a data set as a data set."""
+
+    def __init__(self, scenes: Scenes, index: Int[np.ndarray, " n"]) -> None:
+        self.scenes, self.index = scenes, index
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def batch(self, indices: Int[np.ndarray, " b"]) -> Arrays:
+        """The scenes of these numbers."""
+        return self.scenes.batch(self.index[np.asarray(indices)])
+
+
+class ShapeTable:
+    """Every labelled shape of a data set once, in the order of its number.
+
+    Args:
+        number: number of each shape, ascending.
+        packed: its voxels, packed bits.
+        category: its category label.
+        known: names of instances with labels of their own are numbered below this; others are "novel".
+    """
+
+    def __init__(
+        self,
+        number: Int[np.ndarray, " n"],
+        packed: UInt8[np.ndarray, "n bytes"],
+        category: Int[np.ndarray, " n"],
+        known: int = 0,
+    ) -> None:
+        self.number, self.known = number, known
+        self.packed, self.category = torch.from_numpy(packed), torch.from_numpy(category)
+        self.loc: Float[Tensor, "n d"] | None = None
+        self.scale: Float[Tensor, "n d"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def batch(self, size: int, seed: int, step: int, latent_dim: int, part: slice = slice(None)) -> ShapeBatch:
+        """The shapes of a training step, every epoch a new permutation; depends on seed and step only."""
+        index = torch.from_numpy(batch_indices(len(self), size, seed, step))[part]
+        instance = torch.from_numpy(self.number)[index]
+        instance = torch.where(instance < self.known, instance, -1)
+        noise = seeded_noise(seed, step, size, latent_dim)[part]
+        return ShapeBatch(self.packed[index], self.category[index], instance, noise)
+
+    @torch.no_grad()
+    def teach(self, model: Nolbo) -> None:
+        """Let the trained shape guide encode every shape: the truth of the shape latent in later stages."""
+        model.shape_guide.eval()
+        parts = [model.shape_guide.posterior(part) for part in self.packed.split(256)]
+        self.loc = torch.cat([loc for loc, _ in parts])
+        self.scale = torch.cat([scale for _, scale in parts])
+
+    def add_teacher(self, batch: SceneBatch) -> SceneBatch:
+        """The batch with the shape autoencoder's posterior of each object; a shape that is not in the table is unknown."""
+        if self.loc is None or self.scale is None or len(self) == 0:
+            return batch.replace(has_voxels=torch.zeros_like(batch.has_voxels)) if len(self) == 0 else batch
+        row = torch.from_numpy(np.searchsorted(self.number, batch.instance.numpy()).clip(0, len(self) - 1))
+        known = torch.from_numpy(self.number)[row] == batch.instance
+        return batch.replace(
+            shape_loc=self.loc[row], shape_scale=self.scale[row], has_voxels=batch.has_voxels & known
+        )
+
+
+class SceneSupply:
+    """Shuffled, augmented batches of scenes; step s is a function of (seed, s) alone, whatever came before.
+
+    Args:
+        scenes: the data set.
+        table: its shapes, for the teacher's latents.
+        batch_size: scenes of the joint batch over all processes.
+        seed: seed of order, augmentation and noise.
+        latent_dim: dimensions of the shape latent, for its noise.
+        augmentation: what is done to the images, None for nothing.
+        sizes: image sides to choose from, a step; None for the data set's own.
+        known_instances: numbers below this are instance labels of the model.
+        rank: number of this process.
+        world: number of processes; each takes an equal part of the joint batch.
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        table: ShapeTable,
+        batch_size: int,
+        seed: int,
+        latent_dim: int,
+        augmentation: Augmentation | None = None,
+        sizes: Sequence[int] | None = None,
+        known_instances: int = 0,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
+        if batch_size % world:
+            raise input_error("batch size", got=batch_size, expected=f"a multiple of the {world} processes")
+        self.scenes, self.table, self.batch_size, self.seed = scenes, table, batch_size, seed
+        self.latent_dim, self.augmentation, self.known = latent_dim, augmentation, known_instances
+        self.sizes = tuple(sizes) if sizes else ()
+        self.part = slice(rank * batch_size // world, (rank + 1) * batch_size // world)
+
+    def batch(self, step: int) -> SceneBatch:
+        """The batch of a step (this process's part of it)."""
+        index = batch_indices(len(self.scenes), self.batch_size, self.seed, step)[self.part]
+        batch = self.prepared(index)
+        generator = np.random.default_rng([self.seed, step, 1])
+        size = int(generator.choice(self.sizes)) if self.sizes else None
+        if self.augmentation is not None or size is not None:
+            seeds = generator.integers(2**63, size=self.batch_size)[self.part]
+            batch = augment(batch, self.augmentation, seeds, size)
+        noise = seeded_noise(self.seed, step, self.batch_size, batch.box.shape[1], self.latent_dim)
+        return batch.replace(noise=noise[self.part])
+
+    def prepared(self, index: Int[np.ndarray, " b"]) -> SceneBatch:
+        """Scenes of these numbers as they are, with the teacher's latents."""
+        batch = self.table.add_teacher(to_batch(self.scenes.batch(index)))
+        return batch.replace(instance=torch.where(batch.instance < self.known, batch.instance, -1))

@@ -1,0 +1,113 @@
+"""Fit the calibration factors on held-out scenes: one number a head, so that little data is enough and nothing overfits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float
+from scipy.optimize import minimize
+from scipy.stats import chi2
+from torch import Tensor
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.models.calibration import Calibration
+from nolbo_ppl.models.distributions import VonMisesMixture
+from nolbo_ppl.models.nolbo import Nolbo
+from nolbo_ppl.models.scene import SceneBatch
+
+
+def region_factor(squared: Float[Tensor, " n"], dimensions: int, level: float = 0.9) -> float:
+    """Factor on a Gaussian's scales after which its `level` region covers just that share of the truths.
+
+    `squared` holds squared Mahalanobis distances. A maximum-likelihood factor would follow the heavy tails of the few
+    objects that are taken for something else, and leave the region of all others too wide.
+    """
+    return float(torch.sqrt(torch.quantile(squared.double(), level) / chi2.ppf(level, dimensions)))
+
+
+def _fit(loss, start: list[float]) -> list[float]:  # noqa: ANN001
+    """Minimise a smooth loss of few parameters with gradients from autograd."""
+
+    def value_and_gradient(x):  # noqa: ANN001, ANN202
+        parameters = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+        value = loss(parameters)
+        value.backward()
+        return float(value.detach()), parameters.grad.numpy()
+
+    return [float(v) for v in minimize(value_and_gradient, start, jac=True, method="L-BFGS-B").x]
+
+
+@torch.no_grad()
+def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
+    found: dict[str, list[Tensor]] = {}
+
+    def add(name: str, value: Tensor) -> None:
+        found.setdefault(name, []).append(value.double() if value.is_floating_point() else value)
+
+    for batch in batches:
+        scene = model.guide.observe(batch)
+        where, q = scene.assignment, scene.posterior
+        add("logit", scene.encoding.objectness_logit.flatten())
+        add("is_object", where.is_object.flatten())
+        mask = where.assigned & (batch.visibility >= 0.5)
+        labelled = mask & (batch.category >= 0)
+        add("label_logits", q.label_logits[labelled])
+        add("category", batch.category[labelled])
+        oriented = mask & batch.has_viewpoint
+        add("azimuth_logits", q.azimuth_logits[oriented])
+        add("azimuth_natural", q.azimuth_natural[oriented])
+        add("azimuth", batch.viewpoint[oriented][:, 0])
+        add("order", batch.symmetry[oriented])
+        angle = (q.angle_loc - batch.viewpoint[..., 1:])[oriented] / q.angle_scale[oriented]
+        add("angle", angle.square().sum(-1))
+        box = (q.box_loc - where.box_target)[mask] / q.box_scale[mask]
+        add("box", box.square().sum(-1))
+        ranged = mask & where.has_range
+        add("range", ((q.range_loc - where.range_target)[ranged] / q.range_scale[ranged])[:, :3].square().sum(-1))
+        if batch.shape_loc is not None:
+            shaped = mask & batch.has_voxels
+            add("shape", ((q.shape_loc - batch.shape_loc)[shaped] / q.shape_scale[shaped]).square().sum(-1))
+    return {name: torch.cat(values) for name, values in found.items()}
+
+
+def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
+    """Fit every factor on labelled held-out scenes the network was not trained on.
+
+    Objectness, label and azimuth by maximum likelihood (they are proper scores of discrete or multimodal answers),
+    Gaussian heads by their 90 % regions.
+
+    Raises:
+        InputError: the scenes hold fewer than 50 objects.
+    """
+    model.eval()
+    found = _collect(model, batches)
+    if len(found.get("box", ())) < 50:
+        raise input_error("too few objects to calibrate on", got=len(found.get("box", ())), expected="at least 50")
+
+    def objectness(x: Tensor) -> Tensor:
+        odds = x[0].exp() * found["logit"] + x[1]
+        return torch.nn.functional.binary_cross_entropy_with_logits(odds, found["is_object"].double())
+
+    def label(x: Tensor) -> Tensor:
+        return torch.nn.functional.cross_entropy(x[0].exp() * found["label_logits"], found["category"])
+
+    def azimuth(x: Tensor) -> Tensor:
+        natural = x[0].exp() * found["azimuth_natural"]
+        q = VonMisesMixture(found["azimuth_logits"], natural, max_concentration=model.config.max_concentration)
+        return -q.log_prob_symmetric(found["azimuth"], found["order"]).mean()
+
+    slope, shift = _fit(objectness, [0.0, 0.0])
+    label_slope = _fit(label, [0.0])[0] if len(found["category"]) else 0.0
+    concentration = _fit(azimuth, [0.0])[0] if len(found["azimuth"]) else 0.0
+    factor = torch.tensor([slope, label_slope, concentration]).exp().tolist()
+    return Calibration(
+        objectness_slope=factor[0],
+        objectness_shift=shift,
+        label_slope=factor[1],
+        azimuth_concentration=factor[2],
+        angle_scale=region_factor(found["angle"], 2) if len(found["angle"]) else 1.0,
+        shape_scale=region_factor(found["shape"], model.config.latent_dim) if len(found.get("shape", ())) else 1.0,
+        box_scale=region_factor(found["box"], 4),
+        range_scale=region_factor(found["range"], 3) if len(found["range"]) else 1.0,
+    )
