@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.config import SlamConfig
 from nolbo_ppl.inference.slam.evidence import Pairs, PosteriorSamples
+from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import Estimate
 
 CONSISTENT = 14.0
@@ -54,7 +55,7 @@ def consistency(
     covariance = own[:, None] + own[None] - cross - np.swapaxes(cross, 2, 3)
     covariance = inflation * covariance + 2 * floor**2 * np.eye(3)
     difference = gap[:, None] - gap[None]
-    square = np.einsum("pqi,pqi->pq", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
+    square, _ = squared_distance(difference, covariance)
     together = square < CONSISTENT
     together &= (pairs.a[:, None] != pairs.a[None]) & (pairs.b[:, None] != pairs.b[None])
     return together & together.T
@@ -91,12 +92,14 @@ def find_closing(
     position = estimate.T_world_landmark[:, :3, 3]
     gap = position[pairs.a] - position[pairs.b]
     deviation = samples.position[pairs.a] - samples.position[pairs.b]
-    together = consistency(gap, deviation, pairs, inflation, floor)
+    # Annealing widens what all pairs share (drift); what tells them apart is local and well known.
+    together = consistency(gap, deviation, pairs, min(inflation, 2.0), floor)
     degree = together.sum(axis=1)
     nodes = np.flatnonzero(degree >= config.constellation_minimum - 1)
     if len(nodes) < config.constellation_minimum:
         return None
-    graph = networkx.from_numpy_array(together[np.ix_(nodes, nodes)])
+    graph = networkx.Graph()
+    graph.add_edges_from(np.argwhere(np.triu(together[np.ix_(nodes, nodes)], 1)).tolist())
     cliques = []
     for clique in islice(networkx.find_cliques(graph), CLIQUE_BUDGET):
         if len(clique) >= config.constellation_minimum:

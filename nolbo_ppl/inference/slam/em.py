@@ -136,7 +136,9 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
     if state.closing:
         phase = "constellation"
         log_new = float(np.log(density(state)))
-        accepted = close_constellations(pairs, state.features.first, state.estimate, samples, config, inflation=inflation,
+        # Closed tracklets rest until the soft E-step decides every link anew.
+        fresh = pairs.select(~np.isin(pairs.a, list(state.closed)))
+        accepted = close_constellations(fresh, state.features.first, state.estimate, samples, config, inflation=inflation,
                                         floor=state.link_scale, log_new=log_new)
         closed = dict(state.closed)
         closed.update({int(a): int(b) for c in accepted for a, b in zip(c.a, c.b)})
@@ -145,7 +147,10 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
         a = np.array(list(closed.keys()), dtype=np.int64)
         b = np.array(list(closed.values()), dtype=np.int64)
         links = make_links(state, a, b, np.ones(len(a)))
-        last_round = closed == state.closed or state.iteration + 1 >= config.constellation_rounds
+        news = len(closed) - len(state.closed)
+        # A few more can wait for the soft E-step; the first rounds must anneal.
+        few = news <= 0.02 * len(closed) and state.iteration + 1 >= len(config.annealing)
+        last_round = not closed or few or state.iteration + 1 >= config.constellation_rounds
         state = replace(state, closed=closed, closing=not last_round)
     else:
         links, evidence = soft_links(state, pairs)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.config import SlamConfig
 from nolbo_ppl.inference.slam.features import LARGE_VARIANCE, FeaturePrior, latent_log_density
+from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import Estimate, Linearisation
 from nolbo_ppl.inference.slam.orientation import orientation_log_density
 
@@ -142,10 +143,10 @@ def candidate_pairs(
     a, b = a[compatible], b[compatible]
     covariance = inflation * gap_covariance(samples, a, b) + floor**2 * np.eye(3)
     gap = position[a] - position[b]
-    distance = np.einsum("pi,pi->p", gap, np.linalg.solve(covariance, gap[..., None])[..., 0]) if len(a) else np.zeros(0)
-    inside = distance < POSITION_GATE
-    a, b, covariance, distance = a[inside], b[inside], covariance[inside], distance[inside]
-    log_position = -0.5 * (distance + np.linalg.slogdet(2 * np.pi * covariance)[1])
+    square, log_det = squared_distance(gap, covariance)
+    inside = square < POSITION_GATE
+    a, b = a[inside], b[inside]
+    log_position = -0.5 * (square + log_det)[inside]
     return Pairs(a, b, log_position, feature_log_ratio(estimate, samples, features, prior, config, a, b))
 
 

@@ -12,6 +12,7 @@ from nolbo_ppl.inference.association import association_marginals_batch
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.evidence import TrackletFeatures
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features
+from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import Estimate, Linearisation
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, orientation_log_density, resolved_symmetry
 
@@ -96,10 +97,9 @@ def _gated(
         deviation = np.einsum("pji,pjs->pis", R_camera[frame], moved_landmark[j]) - pose_delta[frame, 3:]
         deviation -= np.cross(pose_delta[frame, :3], local[:, :, None], axis=1)
         S = noise.position_covariance[k] + deviation @ np.swapaxes(deviation, 1, 2) / count
-        square = np.einsum("pi,pi->p", error, np.linalg.solve(S, error[..., None])[..., 0]) if len(k) else np.zeros(0)
-        inside = square < GATE
-        log_det = np.linalg.slogdet(2 * np.pi * S[inside])[1] if inside.any() else np.zeros(0)
-        out.append((k[inside], j[inside], square[inside], log_det))
+        squared, log_determinant = squared_distance(error, S)
+        inside = squared < GATE
+        out.append((k[inside], j[inside], squared[inside], log_determinant[inside]))
     if not out:
         empty = np.zeros(0, dtype=np.int64)
         return empty, empty, np.zeros(0), np.zeros(0)

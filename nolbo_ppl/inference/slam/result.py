@@ -13,6 +13,7 @@ from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.em import StepInfo
 from nolbo_ppl.inference.slam.features import LARGE_VARIANCE, category_index
 from nolbo_ppl.inference.slam.finish import final_graph
+from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import Linearisation, linearise
 from nolbo_ppl.inference.slam.observe import Associations
 from nolbo_ppl.inference.slam.state import SlamState
@@ -136,10 +137,9 @@ class SlamResult:
         predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
         error = predicted - table.position[rows]
         S = state.noise.position_covariance[rows]
-        square = np.einsum("ki,ki->k", error, np.linalg.solve(S, error[..., None])[..., 0]) if len(rows) else np.zeros(0)
         objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
         log_ratio = (np.log(objectness) - np.log1p(-objectness) - np.log(state.noise.clutter_rate)
-                     - 0.5 * (square + np.linalg.slogdet(2 * np.pi * S)[1]))
+                     + log_normal(error, S))
         log_odds = np.full(m, np.log(state.noise.new_rate))
         np.add.at(log_odds, state.landmark, state.weight * log_ratio)
         information = np.tile(1e-12 * np.eye(3), (m, 1, 1))

@@ -12,6 +12,7 @@ from nolbo_ppl.geometry.pose import inverse, make_pose, se3_log, skew, transform
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.evidence import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fit_prior, weighted_latents
+from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import (
     Estimate,
     Linearisation,
@@ -132,9 +133,8 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, "k"]:
     predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
     error = predicted - table.position[rows]
     S = state.noise.position_covariance[rows]
-    square = np.einsum("ki,ki->k", error, np.linalg.solve(S, error[..., None])[..., 0]) if len(rows) else np.zeros(0)
     objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
-    log_object = np.log(objectness) - 0.5 * (square + np.linalg.slogdet(2 * np.pi * S)[1])
+    log_object = np.log(objectness) + log_normal(error, S)
     log_background = np.log1p(-objectness) + np.log(state.noise.clutter_rate)
     return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
 

