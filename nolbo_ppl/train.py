@@ -26,7 +26,7 @@ from tqdm import tqdm
 from nolbo_ppl import __version__
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.cache import CachedScenes, write_cache
-from nolbo_ppl.data.dataset import SceneFolder
+from nolbo_ppl.data.folder import SceneFolder
 from nolbo_ppl.data.loader import Scenes, prefetch
 from nolbo_ppl.data.scene_config import preset as scene_preset
 from nolbo_ppl.data.source import SceneSource
@@ -74,7 +74,7 @@ class TrainConfig:
     """Folder of held-out scenes; with `scenes` and without this, the last tenth of `scenes` is held out."""
     count: int = 20480
     """Number of generated training scenes."""
-    single_count: int = 2048
+    single_count: int = 1024
     """Number of generated scenes with one object, for the second stage."""
     difficulty: Literal["easy", "standard", "full"] = "standard"
     """Difficulty of the generated scenes."""
@@ -84,11 +84,11 @@ class TrainConfig:
     """Where generated scenes are kept."""
     seed: int = 0
     """Seed of weights, scenes, order, augmentation and noise."""
-    shape_steps: int = 1500
+    shape_steps: int = 1200
     """Steps of the shape autoencoder."""
-    single_steps: int = 300
+    single_steps: int = 200
     """Steps on images of one object."""
-    scene_steps: int = 8000
+    scene_steps: int = 6000
     """Steps on scenes."""
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""
@@ -150,8 +150,7 @@ class TrainConfig:
 
     def stages(self) -> list[Stage]:
         """The stages that have steps."""
-        factors = {"orientation_inclusive": 1.0, "label_inclusive": 1.0} if self.objective == "inclusive" else {}
-        weights = scene_weights(self.objective, factors, self.voxel_weight)
+        weights = scene_weights(self.objective, self.voxel_weight)
         images = OptimisationConfig(learning_rate=self.learning_rate)
         stages = [
             Stage(

@@ -64,11 +64,14 @@ INCLUSIVE: dict[str, float] = {
     "objectness_inclusive": 1.0,
     "label_inclusive": 1.0,
     "shape_inclusive": 0.25,
-    "orientation_inclusive": 1.0,
+    "orientation_inclusive": 2.0,
     "box_inclusive": 0.5,
     "range_inclusive": 0.5,
 }
-"""The default objective: the inclusive KL wherever the truth of a latent is known in training."""
+"""The default objective: the inclusive KL wherever the truth of a latent is known in training.
+
+The weights balance gradients, in the proportions found to learn well: viewpoints are the slowest to learn, and sixteen
+latent dimensions would otherwise outweigh one category."""
 
 
 @dataclass

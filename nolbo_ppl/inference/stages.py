@@ -111,12 +111,12 @@ class StageRun:
         self.model.load_state_dict(self.state.average)
 
 
-def scene_weights(objective: str, factors: Mapping[str, float], voxels: float) -> dict[str, float]:
-    """Weights of an objective with factors on some of its terms, and a weight of its own for the voxels.
+def scene_weights(objective: str, voxels: float) -> dict[str, float]:
+    """Weights of an objective, with a weight of its own for the voxels.
 
     Voxel terms are thousands of nats an object while the latent is wrong: at full weight they drown every other head.
     """
-    weights = {**OBJECTIVES[objective], **factors}
+    weights = dict(OBJECTIVES[objective])
     if voxels or objective != "inclusive":
         weights["voxels"] = voxels
     return {name: weight for name, weight in weights.items() if weight}
