@@ -24,9 +24,8 @@ def usage() -> str:
     """The help text."""
     width = max(map(len, VERBS))
     lines = [f"  {name:<{width}}  {text}" for name, text in VERBS.items()]
-    return "\n".join(
-        ["usage: nolbo VERB [options]", "", *lines, "", "nolbo VERB --help tells the options; nolbo --version the version."]
-    )
+    hint = "nolbo VERB --help tells the options; nolbo --version the version."
+    return "\n".join(["usage: nolbo VERB [options]", "", *lines, "", hint])
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -12,7 +12,8 @@ from PIL import Image, UnidentifiedImageError
 from tqdm import tqdm
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.inference.queries import ObservationModel
+from nolbo_ppl.inference.observations import Observations
+from nolbo_ppl.inference.queries import ObservationModel, guessed_intrinsics
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import atomic_path, write_jsonl
 
@@ -102,12 +103,15 @@ def _rows(config: ObserveConfig, paths: list[Path], model: ObservationModel) -> 
             bar.update(len(part))
 
 
-def _draw(config: ObserveConfig, path: Path, image: np.ndarray, observations, model: ObservationModel) -> None:  # noqa: ANN001
+def _draw(
+    config: ObserveConfig, path: Path, image: np.ndarray, observations: Observations, model: ObservationModel
+) -> None:
+    """The posterior over the image, as `OUT/NAME.png`."""
     from nolbo_ppl.viz.observations import draw_observations  # matplotlib is only needed for pictures
 
-    figure = draw_observations(image, observations, intrinsics=config.intrinsics)
+    camera = guessed_intrinsics(image) if config.intrinsics is None else np.array(config.intrinsics)
     with atomic_path(config.out / f"{path.stem}.png") as temporary:
-        figure.savefig(temporary, dpi=120)
+        draw_observations(image, observations, camera, prior_mean=model.prior_mean(), path=temporary)
 
 
 def main(args: Sequence[str] | None = None) -> None:

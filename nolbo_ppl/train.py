@@ -28,6 +28,7 @@ from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.cache import CachedScenes, write_cache
 from nolbo_ppl.data.folder import SceneFolder
 from nolbo_ppl.data.loader import Scenes, prefetch
+from nolbo_ppl.data.scene_config import SceneConfig
 from nolbo_ppl.data.scene_config import preset as scene_preset
 from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.supply import Part, SceneSupply, ShapeTable
@@ -93,9 +94,9 @@ class TrainConfig:
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""
     decode: int = 12
-    """Objects decoded a step once the decoder is free."""
-    voxel_weight: float = 0.0
-    """Weight of the voxel term in the stages on images (needs `freeze` below 1 or the bound as objective)."""
+    """Objects decoded a step where the objective has voxels; their term stands for all objects."""
+    voxel_weight: float | None = None
+    """Weight of the voxel term in the stages on images; by default the objective's own (the inclusive one has none)."""
     batch: int = 64
     """Scenes a step, over all processes."""
     shape_batch: int = 32
@@ -134,7 +135,7 @@ class TrainConfig:
         if any(size % 32 or size <= 0 for size in self.sizes):
             raise input_error("sizes", got=self.sizes, expected="positive multiples of 32")
         if self.instance_labels and self.scenes is None:
-            raise input_error("instance labels", got="generated scenes", do="give --scenes with a finite set of instances")
+            raise input_error("instance labels", got="generated scenes", do="give --scenes with its own instances")
         if self.validation is not None and self.scenes is None:
             raise input_error("held-out scenes without training scenes", do="give --scenes too")
 
@@ -169,7 +170,7 @@ class TrainConfig:
                 dataclasses.replace(images, steps=self.scene_steps, warmup=min(100, self.scene_steps)),
                 weights,
                 freeze=round(self.freeze * self.scene_steps),
-                decode=self.decode,
+                decode=self.decode if weights.get("voxels") else 0,
             ),
         ]
         return [stage for stage in stages if stage.optimisation.steps > 0]
@@ -253,7 +254,8 @@ def _train_stage(
     name, steps = stage_run.stage.name, stage_run.stage.optimisation.steps
     waited, start = 0.0, time.perf_counter()
     batches = data.batches(name, stage_run.state.step)
-    bar = tqdm(total=steps, initial=stage_run.state.step, desc=name, unit="step", disable=True if journal.rank else None)
+    quiet = True if journal.rank else None
+    bar = tqdm(total=steps, initial=stage_run.state.step, desc=name, unit="step", disable=quiet)
     with bar, batches if isinstance(batches, prefetch) else nullcontext():
         while not stage_run.finished:
             before = time.perf_counter()
@@ -281,6 +283,8 @@ class _Data:
         self.config, self.rank, self.world = config, rank, world
         self.model = config.model()
         size = self.model.image_size
+        self.train: Scenes
+        self.single: Scenes
         self._held_out: Scenes
         if config.scenes is not None:
             self._open_folders(config.scenes, size)
@@ -292,15 +296,18 @@ class _Data:
                 distributed.barrier()  # the first process renders what is missing
             single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
 
-            def cached(of, seed: int, count: int) -> CachedScenes:  # noqa: ANN001
+            def cached(of: SceneConfig, seed: int, count: int) -> CachedScenes:
                 return write_cache(root, SceneSource(of, seed, backgrounds=backgrounds), count, config.workers)
 
-            self.train = cached(base, config.seed, config.count)  # type: ignore[no-redef]
-            self._held_out = cached(base, config.seed + VALIDATION_SEED, max(512, config.evaluate_scenes))
-            self.single = cached(single, config.seed, config.single_count) if config.single_steps else self.train  # type: ignore[no-redef]
+            train = cached(base, config.seed, config.count)
+            held_out_scenes = cached(base, config.seed + VALIDATION_SEED, max(512, config.evaluate_scenes))
+            self.train, self._held_out = train, held_out_scenes
+            self.single = self.train
+            if config.single_steps:
+                self.single = cached(single, config.seed, config.single_count)
             if world > 1 and rank == 0:
                 distributed.barrier()
-            self.table, self._held_out_table = ShapeTable(*self.train.shapes()), ShapeTable(*self._held_out.shapes())
+            self.table, self._held_out_table = ShapeTable(*train.shapes()), ShapeTable(*held_out_scenes.shapes())
         if len(self.table) == 0 and config.shape_steps:
             raise input_error("no shapes to learn", got=config.scenes, do="add voxels.npz, or use --shape-steps 0")
 
@@ -317,9 +324,9 @@ class _Data:
             others = tuple(name for name in folder.instances if name not in set(names))
             folder = SceneFolder(path, self.model.categories, names + others, size=size)
             known = len(names)
-        self.train: Scenes = folder
+        self.train = folder
         self.table = ShapeTable(*folder.shapes(), known)
-        self.single: Scenes = folder
+        self.single = folder
         if self.config.validation is None:
             cut = len(folder) - max(1, len(folder) // 10)
             self.train, self._held_out = Part(folder, np.arange(cut)), Part(folder, np.arange(cut, len(folder)))
@@ -332,7 +339,8 @@ class _Data:
         """Batches of a stage from a step on."""
         config, latent = self.config, self.model.latent_dim
         if stage == "shapes":
-            part = slice(self.rank * config.shape_batch // self.world, (self.rank + 1) * config.shape_batch // self.world)
+            size, rank, world = config.shape_batch, self.rank, self.world
+            part = slice(rank * size // world, (rank + 1) * size // world)
             seed = 3 * config.seed
 
             def shapes() -> Iterator[Any]:
@@ -358,9 +366,8 @@ class _Data:
 
     def validation(self, count: int | None) -> Iterator[SceneBatch]:
         """Held-out batches, without augmentation, with the teacher's latents."""
-        supply = SceneSupply(
-            self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, known_instances=len(self.model.instances)
-        )
+        known = len(self.model.instances)
+        supply = SceneSupply(self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, known_instances=known)
         total = len(self._held_out) if count is None else min(count, len(self._held_out))
         for first in range(0, total, 64):
             yield supply.prepared(torch.arange(first, min(first + 64, total)).numpy())
@@ -462,7 +469,7 @@ class _Journal:
             self._board.close()
 
 
-_FREE = ("out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every")
+_FREE = ("out", "cache", "threads", "workers", "log_every", "checkpoint_every", "evaluate_every", "tensorboard", "resume")
 """Fields a resumed run may change: they do not touch what is learnt."""
 
 

@@ -108,7 +108,7 @@ def augment(
         size: longer side of the resulting images, a multiple of 32; None keeps the size.
     """
     if len(seeds) != len(batch.image):
-        raise input_error("seeds of an augmentation", got=len(seeds), expected=f"one for each of {len(batch.image)} scenes")
+        raise input_error("augmentation seeds", got=len(seeds), expected=f"one for each of {len(batch.image)} scenes")
     height, width = batch.image.shape[-2:]
     factor = 1.0 if size is None else size / max(height, width)
     target = (max(32, round(height * factor / 32) * 32), max(32, round(width * factor / 32) * 32))
@@ -133,7 +133,7 @@ def _move(
     target: tuple[int, int],
     least_visible: float,
 ) -> tuple[SceneBatch, Float[Tensor, "b 3 h2 w2"]]:
-    """Zoom about the middle and shift; a pixel x of the image goes to `ratio * (zoom * (x - middle) + middle + shift)`."""
+    """Zoom about the middle and shift: pixel x goes to `ratio * (zoom * (x - middle) + middle + shift)`."""
     height, width = image.shape[-2:]
     dtype = batch.box.dtype
     extent = torch.tensor([width, height], dtype=dtype)

@@ -80,7 +80,7 @@ class ShapeTable:
         self.scale = torch.cat([scale for _, scale in parts])
 
     def add_teacher(self, batch: SceneBatch) -> SceneBatch:
-        """The batch with the shape autoencoder's posterior of each object; a shape that is not in the table is unknown."""
+        """The batch with the teacher's posterior of each object; a shape that is not in the table is unknown."""
         if self.loc is None or self.scale is None or len(self) == 0:
             return batch.replace(has_voxels=torch.zeros_like(batch.has_voxels)) if len(self) == 0 else batch
         row = torch.from_numpy(np.searchsorted(self.number, batch.instance.numpy()).clip(0, len(self) - 1))

@@ -27,6 +27,13 @@ Image = UInt8[np.ndarray, "h w 3"] | UInt8[Tensor, "3 h w"]
 """An image: a uint8 array of height x width x 3 colours, or a torch tensor with the colours first."""
 
 
+def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 4"]:
+    """Intrinsics of a camera that sees 60 degrees across: what is assumed when none are given."""
+    height, width = image.shape[:2]
+    focal = width / (2 * math.tan(math.radians(30)))
+    return np.array([focal, focal, width / 2, height / 2])
+
+
 @dataclass(frozen=True)
 class _Prepared:
     """An image as the network takes it."""
@@ -182,8 +189,7 @@ class ObservationModel:
         if min(height, width) < 8:
             raise input_error("an image", got=f"{width} x {height} px", expected="at least 8 x 8 px")
         if intrinsics is None:
-            focal = width / (2 * math.tan(math.radians(30)))
-            camera = np.array([focal, focal, width / 2, height / 2])
+            camera = guessed_intrinsics(image)
         else:
             camera = np.asarray(intrinsics, dtype=np.float64)
             if camera.shape != (4,) or not np.isfinite(camera).all() or (camera[:2] <= 0).any():

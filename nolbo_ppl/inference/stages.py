@@ -34,7 +34,7 @@ class Stage:
     freeze: int = 0
     """Steps, from the first, during which decoder and prior networks stay as they are (normalisation included)."""
     decode: int = 0
-    """Objects decoded a step once decoder and prior are free; their voxel term stands for all objects."""
+    """Objects decoded a step; their voxel term stands for all objects. 0 where voxels have no weight."""
 
 
 class ShapeLoss(nn.Module):
@@ -90,8 +90,8 @@ class StageRun:
 
     def step(self, batch: SceneBatch | ShapeBatch) -> optimisation.StepInfo:
         """One optimiser step."""
-        frozen = self.set_modes()
-        arguments = {} if self.stage.name == "shapes" else {"decode": 0 if frozen else self.stage.decode}
+        self.set_modes()
+        arguments = {} if self.stage.name == "shapes" else {"decode": self.stage.decode}
         self.state, info = optimisation.step(self.state, batch, **arguments)
         return info
 
@@ -111,13 +111,13 @@ class StageRun:
         self.model.load_state_dict(self.state.average)
 
 
-def scene_weights(objective: str, voxels: float) -> dict[str, float]:
-    """Weights of an objective, with a weight of its own for the voxels.
+def scene_weights(objective: str, voxels: float | None = None) -> dict[str, float]:
+    """Weights of an objective, where wanted with another weight of the voxels.
 
     Voxel terms are thousands of nats an object while the latent is wrong: at full weight they drown every other head.
     """
     weights = dict(OBJECTIVES[objective])
-    if voxels or objective != "inclusive":
+    if voxels is not None:
         weights["voxels"] = voxels
     return {name: weight for name, weight in weights.items() if weight}
 
