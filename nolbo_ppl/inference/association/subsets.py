@@ -227,8 +227,11 @@ def _forward(
     chain[0] = 1.0
     for step in range(steps):
         before = store[offset[step] : offset[step + 1]]
-        for state in range(before.shape[0]):  # members that open are in no state yet
-            before[state] = chain[at + state] if state < kept else 0.0
+        stage = chain[at : at + kept]
+        for state in range(kept):
+            before[state] = stage[state]
+        for state in range(kept, before.shape[0]):  # members that open are in no state yet
+            before[state] = 0.0
         _take_step(before, chain, width[step], slots[step], weights[step], alone_step[step])
         at, open_count = _close_all(chain, step, width[step], slots[step], last, alone_member)
         kept = 1 << open_count
