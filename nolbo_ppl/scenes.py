@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.dataset import write_scenes
 from nolbo_ppl.data.pool import INSTANCES
 from nolbo_ppl.data.scene_config import preset
@@ -44,7 +45,6 @@ def source_of(config: ScenesConfig) -> SceneSource:
     cad = None
     if config.cad is not None:
         from nolbo_ppl.data.cad import load_cad_folder
-        from nolbo_ppl.categories import CATEGORIES
 
         cad = tuple(load_cad_folder(config.cad, CATEGORIES))
     backgrounds = None if config.backgrounds is None else str(config.backgrounds)

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from nolbo_ppl.data.materials import hsv
 from nolbo_ppl.data.pictures import Photographs, drawn_picture
-from nolbo_ppl.data.render import Backdrop, Light, Surface
 from nolbo_ppl.data.scene_config import SceneConfig
+from nolbo_ppl.data.view import Backdrop, Light, Surface
 
 
 def _tint(rng: np.random.Generator, tint: float) -> np.ndarray:
@@ -19,7 +19,7 @@ def _tint(rng: np.random.Generator, tint: float) -> np.ndarray:
 
 def sample_light(
     config: SceneConfig, rng: np.random.Generator, R_camera_world: Float[np.ndarray, "3 3"]
-) -> tuple[tuple[Light, ...], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+) -> tuple[tuple[Light, ...], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
     """One or two lights, and the ambient light from above and from below."""
     lights = []
     count = 1 + int(rng.random() < config.second_light_probability)

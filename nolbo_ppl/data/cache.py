@@ -55,7 +55,7 @@ def _write_shard(source: SceneSource, folder: Path, shard: int, slots: int) -> i
     del images
     labels["viewpoint"] = allocentric_viewpoints(labels)
     labels["voxel_instance"] = np.array(sorted(voxels), dtype=np.int64)
-    np.savez(temporary / "labels.npz", **labels)
+    np.savez(temporary / "labels.npz", **labels)  # type: ignore[arg-type]
     rows = [voxels[number] for number in sorted(voxels)]
     np.save(temporary / "voxels.npy", np.array(rows, dtype=np.uint8).reshape(len(rows), VOXELS**3 // 8))
     final = folder / f"shard-{shard:05d}"
@@ -142,7 +142,7 @@ class CachedScenes:
             InputError: a number outside [0, count).
         """
         index = np.asarray(indices, dtype=np.int64)
-        if index.size and not (0 <= index.min() and index.max() < self.count):
+        if index.size and (index.min() < 0 or index.max() >= self.count):
             raise input_error("no such scene in the cache", got=index.tolist(), expected=f"0 to {self.count - 1}")
         images = np.stack([self._images[i // BLOCK][i % BLOCK] for i in index])
         labels = {name: array[index] for name, array in self.labels.items()}

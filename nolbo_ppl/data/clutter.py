@@ -20,7 +20,7 @@ class Primitive:
     """One of `KINDS`."""
     linear: Float[np.ndarray, "3 3"]
     """Maps the unit primitive's frame to the piece's frame: rotation times scale."""
-    offset: Float[np.ndarray, "3"]
+    offset: Float[np.ndarray, " 3"]
     """Centre of the primitive in the piece's frame."""
 
 
@@ -76,7 +76,8 @@ def sample_clutter(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.
     elif style < 0.5:
         thin = rng.uniform(0.03, 0.12)
         size = np.array([thin, thin, 1.0]) if rng.random() < 0.6 else np.array([thin, rng.uniform(0.5, 1.5), 0.8])
-        parts = [_primitive("cylinder" if rng.random() < 0.5 and size[1] == thin else "box", size, _turn(rng, 0), np.zeros(3))]
+        kind = "cylinder" if rng.random() < 0.5 and size[1] == thin else "box"
+        parts = [_primitive(kind, size, _turn(rng, 0.0), np.zeros(3))]
         if rng.random() < 0.4:
             top = np.array([0, 0, 0.5])
             parts.append(_primitive(KINDS[int(rng.integers(3))], rng.uniform(0.1, 0.4, 3), _turn(rng, 0.0), top))

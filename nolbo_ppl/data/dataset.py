@@ -37,7 +37,7 @@ def _write_chunk(source: SceneSource, out: Path, first: int, last: int) -> int:
             voxels.setdefault(label.instance, label.item.voxels)
     parts = out / ".parts"
     with atomic_path(parts / f"{first:06d}.npz") as temporary:
-        np.savez(temporary, **voxels)
+        np.savez(temporary, **voxels)  # type: ignore[arg-type]
     write_jsonl(parts / f"{first:06d}.jsonl", rows)
     return last - first
 
@@ -108,6 +108,6 @@ def _join(out: Path, count: int) -> None:
             voxels.update(stored)
         rows.extend(row for _, row in read_jsonl(parts / f"{first:06d}.jsonl"))
     with atomic_path(out / "voxels.npz") as temporary:
-        np.savez_compressed(temporary, **dict(sorted(voxels.items())))
+        np.savez_compressed(temporary, **dict(sorted(voxels.items())))  # type: ignore[arg-type]
     write_jsonl(out / SCENES, rows)
     shutil.rmtree(parts)

@@ -141,7 +141,8 @@ class SceneFolder:
         for row, record in enumerate(self.records):
             scale, left, top = self._placing(row)
             shift = np.array([left, top])
-            labels["intrinsics"][row] = np.concatenate((record.intrinsics[:2] * scale, record.intrinsics[2:] * scale + shift))
+            labels["intrinsics"][row] = record.intrinsics * scale
+            labels["intrinsics"][row, 2:] += shift
             for slot, thing in enumerate(record.objects):
                 at = (row, slot)
                 labels["present"][at] = True
@@ -172,7 +173,7 @@ class SceneFolder:
         except OSError as error:
             raise input_error("not a readable picture", got=error, file=path) from None
 
-    def intrinsics(self, index: int) -> Float[np.ndarray, "4"]:
+    def intrinsics(self, index: int) -> Float[np.ndarray, " 4"]:
         """Intrinsics of a row at the image's own size."""
         return self.records[index].intrinsics
 
@@ -183,7 +184,7 @@ class SceneFolder:
             InputError: a row that is not there, or an image that cannot be decoded.
         """
         index = np.asarray(indices, dtype=np.int64)
-        if index.size and not (0 <= index.min() and index.max() < len(self)):
+        if index.size and (index.min() < 0 or index.max() >= len(self)):
             raise input_error("no such image in the data set", got=index.tolist(), expected=f"0 to {len(self) - 1}")
         images = np.stack([letterbox(self.image(int(i)), self.size)[0].transpose(2, 0, 1) for i in index])
         labels = {name: array[index] for name, array in self.labels.items()}
@@ -205,6 +206,7 @@ class SceneFolder:
                 number = self._number.get(thing.instance or "", -1)
                 if bits is not None and number >= 0 and thing.category is not None:
                     found[number] = (bits, self.categories.index(thing.category))
-        number = np.array(sorted(found), dtype=np.int64)
-        packed = np.array([found[n][0] for n in sorted(found)], dtype=np.uint8).reshape(len(found), VOXELS**3 // 8)
-        return number, packed, np.array([found[n][1] for n in sorted(found)], dtype=np.int64)
+        order = sorted(found)
+        packed = np.array([found[n][0] for n in order], dtype=np.uint8).reshape(len(found), VOXELS**3 // 8)
+        category = np.array([found[n][1] for n in order], dtype=np.int64)
+        return np.array(order, dtype=np.int64), packed, category

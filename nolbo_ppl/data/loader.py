@@ -30,7 +30,7 @@ class Scenes(Protocol):
         """The scenes of these numbers."""
 
 
-def batch_indices(total: int, batch_size: int, seed: int, step: int) -> Int[np.ndarray, "{batch_size}"]:
+def batch_indices(total: int, batch_size: int, seed: int, step: int) -> Int[np.ndarray, " {batch_size}"]:
     """Numbers of the scenes of one training step: every epoch is a new permutation, and batches run over its end.
 
     Raises:
@@ -84,7 +84,7 @@ def streamed_batches(
     yield from parallel(jobs, workers, ahead=3)
 
 
-class prefetch(Iterator[T]):  # noqa: N801 - used like a function
+class prefetch(Iterator[T]):
     """Run an iterator on a thread, up to `depth` results ahead.
 
     An exception of the iterator is raised where its result would have been. `close` (or leaving the `with` block) stops

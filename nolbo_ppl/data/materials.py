@@ -175,7 +175,8 @@ def sample_material(role: str, rng: np.random.Generator) -> Material:
             light = hsv(r.random(), _between(r, 0.0, 0.6 if role == "label" else 0.15), _between(r, 0.75, 1.0))
             return _matt(r, light, contrast=_between(r, 0.0, 0.2))
         case "display":
-            return Material(hsv(_between(r, 0.08, 0.14), 0.9, 0.9), glow=0.7, pattern="noise", contrast=0.6, frequency=30)
+            amber = hsv(_between(r, 0.08, 0.14), 0.9, 0.9)
+            return Material(amber, glow=0.7, pattern="noise", contrast=0.6, frequency=30)
         case "metal":
             return _metal(r, 0.4, 0.85)
         case "dark_metal":

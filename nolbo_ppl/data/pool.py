@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.data.render import Mesh
 from nolbo_ppl.data.shapes import Shape, shape_from_seed
+from nolbo_ppl.data.view import Mesh
 from nolbo_ppl.errors import input_error
 
 INSTANCES = 2000
 """Default number of parametric instances a category has."""
 SEED_STRIDE = 100_000
-"""Instance k of the data set with seed s is `shape_from_seed(category, s * SEED_STRIDE + k)`: no two seeds share one."""
+"""Instance k of the scenes with seed s is `shape_from_seed(category, s * SEED_STRIDE + k)`: no two seeds share one."""
 KEPT = 1024
 """Shapes with their ray-casting structures held in memory: more than one block of scenes draws from."""
 BLOCK = 1024

@@ -2,8 +2,8 @@
 
 A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objects": [...]}`; an object is
 `{"box": [x0, y0, x1, y1] px, "category", "instance", "rotation": [qx, qy, qz, qw] of R_camera_object, "position":
-[x, y, z] m of the box centre in the camera frame, "size": m (box diagonal), "dimensions": [3] m, "visibility", "symmetry"}`.
-Only `image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
+[x, y, z] m of the box centre in the camera frame, "size": m (box diagonal), "dimensions": [3] m, "visibility",
+"symmetry"}`. Only `image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ BORDER_TOLERANCE = 1.0
 class ObjectRecord:
     """One labelled object; None where a label is missing."""
 
-    box: Float[np.ndarray, "4"]
+    box: Float[np.ndarray, " 4"]
     category: str | None
     instance: str | None
     R_camera_object: Float[np.ndarray, "3 3"] | None
-    position: Float[np.ndarray, "3"] | None
+    position: Float[np.ndarray, " 3"] | None
     size: float | None
     visibility: float
     symmetry: int
@@ -48,7 +48,7 @@ class SceneRecord:
     """One labelled image."""
 
     image: Path
-    intrinsics: Float[np.ndarray, "4"]
+    intrinsics: Float[np.ndarray, " 4"]
     objects: tuple[ObjectRecord, ...]
 
 
@@ -73,6 +73,11 @@ def record_of(rendered: Rendered, image: str) -> dict[str, Any]:
     return {"image": image, "intrinsics": [round(float(v), 6) for v in rendered.intrinsics], "objects": objects}
 
 
+def _is_number(value: object) -> bool:
+    """A finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 class _Line:
     """Where a value came from, for the errors."""
 
@@ -85,16 +90,14 @@ class _Line:
     def numbers(self, row: dict[str, Any], field: str, where: str, n: int, expected: str) -> np.ndarray:
         """A list of n finite numbers."""
         value = row.get(field)
-        ok = isinstance(value, list) and len(value) == n
-        ok = ok and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
-        if not ok:
+        if not isinstance(value, list) or len(value) != n or not all(_is_number(v) for v in value):
             raise self.error(f"{where}{field}", value, expected)
         return np.array(value, dtype=np.float64)
 
     def number(self, row: dict[str, Any], field: str, where: str, expected: str) -> float:
         """One finite number."""
         value = row[field]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if not _is_number(value):
             raise self.error(f"{where}{field}", value, expected)
         return float(value)
 
@@ -191,6 +194,7 @@ def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Pat
     path = folder / name
     if not path.is_file():
         raise input_error(
-            "image", got=name, expected=f"an image file in {folder}", do="is the data set complete?", file=file, line=line
-        )
+            "image", got=name, expected=f"an image file in {folder}", do="is the data set complete?",
+            file=file, line=line,
+        )  # fmt: skip
     return path

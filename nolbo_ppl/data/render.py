@@ -1,6 +1,6 @@
-"""Ray casting: a camera at the origin, placed meshes, a ground plane, a backdrop, directional lights with hard shadows.
+"""Ray casting: which mesh each pixel shows, hard shadows, and the image as linear light or display values.
 
-Everything lives in the camera frame (x right, y down, z forward). Each mesh keeps its own Embree scene in its own frame,
+Everything lives in the camera frame (x right, y down, z forward). Each mesh keeps an Embree scene in its own frame,
 built once: placing it costs nothing, rays are moved into its frame instead. Building a scene costs 2.5 us a triangle in
 the wrapper against 0.12 us a ray, so one scene per mesh beats one merged scene per image, and the silhouette of an
 object without the others, which its visibility needs, comes for free.
@@ -9,150 +9,16 @@ object without the others, which its visibility needs, comes for free.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int, UInt8
 
-from nolbo_ppl.data import shading, textures
-from nolbo_ppl.data.materials import Material, material_table
+from nolbo_ppl.data import shading
+from nolbo_ppl.data.materials import material_table
+from nolbo_ppl.data.view import Placed, View
 
 NEAR = 1e-3
 """Depth before which a vertex counts as behind the camera, in scene units."""
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles in their own frame, with a part number a face, ready to be hit by rays."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    part: Int[np.ndarray, " f"]
-
-    @cached_property
-    def scene(self) -> EmbreeScene:
-        """The Embree scene of this mesh alone."""
-        scene = EmbreeScene()
-        TriangleMesh(scene, np.ascontiguousarray(self.vertices[self.faces], dtype=np.float32))
-        return scene
-
-    @cached_property
-    def normals(self) -> Float[np.ndarray, "f 3"]:
-        """Unit normal of each face; zero for a degenerate one."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-        return normal.astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A mesh in the camera frame: point = linear @ local + offset."""
-
-    mesh: Mesh
-    linear: Float[np.ndarray, "3 3"]
-    offset: Float[np.ndarray, "3"]
-    materials: tuple[Material, ...]
-    """Material of each part number of the mesh."""
-    owner: int
-    """Number of the labelled object it belongs to, or -1 for clutter."""
-    texture_seed: int = 0
-    """Which random texture its materials show."""
-
-    @cached_property
-    def inverse(self) -> Float[np.ndarray, "3 3"]:
-        """Takes directions of the camera frame into the mesh's frame."""
-        return np.linalg.inv(self.linear)
-
-    @cached_property
-    def vertices(self) -> Float[np.ndarray, "v 3"]:
-        """Vertices in the camera frame."""
-        return self.mesh.vertices @ self.linear.T + self.offset
-
-    @cached_property
-    def radius(self) -> float:
-        """Radius of the ball about `offset` that holds the mesh, in the camera frame."""
-        difference = self.vertices - self.offset
-        return float(np.sqrt(np.einsum("vd,vd->v", difference, difference).max()))
-
-
-@dataclass(frozen=True)
-class Light:
-    """A light far away."""
-
-    direction: Float[np.ndarray, "3"]
-    """Unit vector towards the light, camera frame."""
-    colour: Float[np.ndarray, "3"]
-    """Irradiance on a surface facing it, linear RGB."""
-    shadow: bool = True
-    """Whether it throws shadows."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """The look of a large plane."""
-
-    colours: Float[np.ndarray, "2 3"]
-    """Two albedos, linear RGB; the pattern mixes them."""
-    pattern: str = "plain"
-    """One of `textures.PLANE_PATTERNS`."""
-    frequency: float = 1.0
-    """Periods per scene unit."""
-    seed: int = 0
-    """Which random texture."""
-
-    def arrays(self) -> tuple[np.ndarray, int, float, int]:
-        """Colours, number of the pattern, frequency and seed, as the compiled shading takes them."""
-        colours = np.ascontiguousarray(self.colours, dtype=np.float32)
-        return colours, textures.PLANE_PATTERNS.index(self.pattern), float(self.frequency), int(self.seed)
-
-
-@dataclass(frozen=True)
-class Backdrop:
-    """What is seen where no mesh is."""
-
-    zenith: Float[np.ndarray, "3"]
-    """Colour of the sky overhead, linear RGB."""
-    horizon: Float[np.ndarray, "3"]
-    """Colour of the sky at the horizon."""
-    ground: Surface
-    """The plane the objects stand on."""
-    wall: Surface | None = None
-    """An upright plane behind everything, or none."""
-    wall_distance: float = 10.0
-    """Distance of that wall along its normal, scene units."""
-    wall_normal: Float[np.ndarray, "3"] | None = None
-    """Horizontal unit vector from the camera to the wall."""
-    picture: Float[np.ndarray, "height width 3"] | None = None
-    """A photograph or drawn picture that covers sky, wall and ground; linear RGB of the image's own size."""
-    clouds: float = 0.0
-    """Contrast of clouds in the sky."""
-    seed: int = 0
-    """Which clouds."""
-
-
-@dataclass(frozen=True)
-class View:
-    """All that one image shows."""
-
-    height: int
-    width: int
-    intrinsics: Float[np.ndarray, "4"]
-    up: Float[np.ndarray, "3"]
-    """The world's vertical in the camera frame."""
-    north: Float[np.ndarray, "3"]
-    """A horizontal direction in the camera frame, along which the ground's texture runs."""
-    camera_height: float
-    """Height of the camera above the ground, scene units."""
-    placed: tuple[Placed, ...]
-    lights: tuple[Light, ...]
-    ambient_sky: Float[np.ndarray, "3"]
-    """Light from above where no lamp shines."""
-    ambient_ground: Float[np.ndarray, "3"]
-    """Light from below."""
-    backdrop: Backdrop
 
 
 @dataclass(frozen=True)
@@ -174,7 +40,7 @@ class Hits:
 
 
 def pixel_directions(
-    x0: int, y0: int, x1: int, y1: int, intrinsics: Float[np.ndarray, "4"], step: int = 1
+    x0: int, y0: int, x1: int, y1: int, intrinsics: Float[np.ndarray, " 4"], step: int = 1
 ) -> Float[np.ndarray, "n 3"]:
     """Rays with z = 1 through the pixel centres of columns x0 to x1 and rows y0 to y1, row by row; float32."""
     fx, fy, cx, cy = intrinsics
@@ -197,7 +63,7 @@ def _first_hits(placed: Placed, directions: np.ndarray) -> tuple[np.ndarray, np.
     return hit["primID"], np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
 
 
-def image_window(placed: Placed, intrinsics: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"] | None:
+def image_window(placed: Placed, intrinsics: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 4"] | None:
     """Box [x0, y0, x1, y1] px of the projected vertices; None when some lie behind the camera."""
     points = placed.vertices
     if points[:, 2].min() <= NEAR:
@@ -245,7 +111,7 @@ def trace(view: View) -> Hits:
 
 
 def shadowed(
-    view: View, points: Float[np.ndarray, "n 3"], light: Float[np.ndarray, "3"]
+    view: View, points: Float[np.ndarray, "n 3"], light: Float[np.ndarray, " 3"]
 ) -> Bool[np.ndarray, " n"]:
     """Which points (camera frame, already lifted off their surface) a mesh hides from the light in that direction."""
     dark = np.zeros(len(points), dtype=bool)
@@ -265,9 +131,9 @@ def _f32(*arrays: np.ndarray) -> list[np.ndarray]:
     return [np.ascontiguousarray(array, dtype=np.float32) for array in arrays]
 
 
-def _stack(arrays: list[np.ndarray], shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-    """Stack or concatenate, giving an array of the right kind when there is none."""
-    return np.ascontiguousarray(arrays, dtype=dtype) if arrays else np.zeros(shape, dtype=dtype)
+def _stack(arrays: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    """Stack in single precision, giving an array of the right kind when there is none."""
+    return np.ascontiguousarray(arrays, dtype=np.float32) if arrays else np.zeros(shape, dtype=np.float32)
 
 
 def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
@@ -292,7 +158,7 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
         np.concatenate([mesh.normals for mesh in meshes]) if meshes else np.zeros((1, 3), np.float32),
         np.concatenate([mesh.part for mesh in meshes]) if meshes else np.zeros(1, np.int64),
         np.cumsum([0, *materials]),
-        _stack([placed.texture_seed for placed in view.placed], (1,), np.int64),
+        np.array([placed.texture_seed for placed in view.placed], dtype=np.int64),
         table.albedo,
         table.pattern,
         table.contrast,
@@ -312,8 +178,9 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
         facing, lifted = shading.facing_points(points, normals, kind, direction)
         if light.shadow and len(facing):
             lit[number, facing] = ~shadowed(view, lifted, direction)
-    has_picture = backdrop.picture is not None
-    picture = _f32(backdrop.picture.reshape(-1, 3))[0] if has_picture else np.zeros((1, 3), np.float32)
+    picture = np.zeros((1, 3)) if backdrop.picture is None else backdrop.picture.reshape(-1, 3)
+    picture, ambient_sky, ambient_ground = _f32(picture, view.ambient_sky, view.ambient_ground)
+    zenith, horizon = _f32(backdrop.zenith, backdrop.horizon)
     colour = shading.illuminate(
         view.width,
         _f32(view.intrinsics)[0],
@@ -325,7 +192,10 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
         _stack([light.direction for light in view.lights], (0, 3)),
         _stack([light.colour for light in view.lights], (0, 3)),
         up,
-        *_f32(view.ambient_sky, view.ambient_ground, backdrop.zenith, backdrop.horizon),
+        ambient_sky,
+        ambient_ground,
+        zenith,
+        horizon,
         table.specular,
         table.shininess,
         table.mirror,
@@ -333,7 +203,7 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
         np.float32(view.camera_height),
         np.float32(backdrop.clouds),
         backdrop.seed,
-        has_picture,
+        backdrop.picture is not None,
         picture,
     )
     return colour.reshape(view.height, view.width, 3)
@@ -344,7 +214,9 @@ GAMMA = np.linspace(0.0, 1.0, 8192, dtype=np.float32) ** np.float32(1 / 2.2)
 
 
 def to_display(
-    colour: Float[np.ndarray, "height width 3"], exposure: float, noise: Float[np.ndarray, "height width 3"] | None = None
+    colour: Float[np.ndarray, "height width 3"],
+    exposure: float,
+    noise: Float[np.ndarray, "height width 3"] | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Eight-bit display values of linear light: exposure, clipping, gamma 2.2, noise (over full range), rounding."""
     scaled = np.clip(colour * np.float32(exposure * (len(GAMMA) - 1)), 0, len(GAMMA) - 1)

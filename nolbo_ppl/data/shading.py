@@ -70,12 +70,12 @@ def surfaces(
     material_contrast: np.ndarray,
     material_frequency: np.ndarray,
     up: np.ndarray,
-    camera_height: float,
+    camera_height: np.float32,
     north: np.ndarray,
     ground: tuple,
     has_wall: bool,
     wall_normal: np.ndarray,
-    wall_distance: float,
+    wall_distance: np.float32,
     wall: tuple,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Point, normal towards the camera, albedo and kind of what each pixel shows."""
@@ -159,8 +159,8 @@ def facing_points(
 
 
 @numba.njit(cache=True)
-def behind_ball(points: np.ndarray, dark: np.ndarray, centre: np.ndarray, radius: float, light: np.ndarray) -> tuple:
-    """Numbers of the points, not dark yet, whose ray to the light may meet a ball, and their offsets from its centre."""
+def behind_ball(points: np.ndarray, dark: np.ndarray, centre: np.ndarray, radius: np.float32, light: np.ndarray) -> tuple:
+    """Numbers of the points, not dark yet, whose ray to the light may meet a ball; their offsets from its centre."""
     chosen = np.empty(len(points), dtype=np.int64)
     offset = np.empty((len(points), 3), dtype=np.float32)
     count = 0
@@ -203,13 +203,13 @@ def illuminate(
     shininess: np.ndarray,
     mirror: np.ndarray,
     glow: np.ndarray,
-    camera_height: float,
-    clouds: float,
+    camera_height: np.float32,
+    clouds: np.float32,
     cloud_seed: int,
     has_picture: bool,
     picture: np.ndarray,
 ) -> np.ndarray:
-    """Linear RGB of each pixel: hemisphere ambient, Lambert, Blinn-Phong, a mirrored sky; pictures take shadows only."""
+    """Linear RGB of each pixel: hemisphere ambient, Lambert, Blinn-Phong, a mirrored sky; pictures take shadow only."""
     n = len(points)
     colour = np.empty((n, 3), dtype=np.float32)
     diffuse = np.empty(3, dtype=np.float32)

@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 
+from nolbo_ppl.data.compose import scene_at
 from nolbo_ppl.data.pictures import Photographs
 from nolbo_ppl.data.pool import INSTANCES, ShapePool
-from nolbo_ppl.data.scene import Rendered, Scene, render_scene, scene_at
+from nolbo_ppl.data.scene import Rendered, Scene, render_scene
 from nolbo_ppl.data.scene_config import SceneConfig
 from nolbo_ppl.data.shapes import Shape
 
