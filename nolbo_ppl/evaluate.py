@@ -7,18 +7,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from nolbo_ppl import __version__
-from nolbo_ppl.data.scene import Rendered
+from nolbo_ppl.data.folder import SceneFolder
 from nolbo_ppl.data.scene_config import preset
 from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.data.truth import FolderScenes, GeneratedScenes, Scenes
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.inference.measure import SceneTruth, measure_detections, measure_objects
+from nolbo_ppl.inference.measure import measure_detections, measure_objects
 from nolbo_ppl.inference.queries import ObservationModel
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import write_json
@@ -32,6 +33,7 @@ from nolbo_ppl.metrics.figures import (
     figures,
 )
 from nolbo_ppl.metrics.intervals import Estimate
+from nolbo_ppl.models.config import ModelConfig
 
 SEED = 9001
 """Default seed of generated scenes: neither the scenes nor the shapes of another seed are among them."""
@@ -51,7 +53,7 @@ class EvaluateConfig:
     """Scenes to generate, or at most to read."""
     seed: int = SEED
     """Seed of the generated scenes and their shapes."""
-    difficulty: str = "standard"
+    difficulty: Literal["easy", "standard", "full"] = "standard"
     """Generated scenes: easy, standard or full."""
     cad: Path | None = None
     """Folder of CAD shapes to generate scenes from, in place of parametric ones."""
@@ -71,62 +73,26 @@ class EvaluateConfig:
     """Draw plots and examples."""
 
 
-class Scenes(Protocol):
-    """Labelled scenes by number."""
+def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
+    """The scenes the configuration asks for: those of a folder, or generated ones.
 
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: int) -> SceneTruth: ...
-
-
-@dataclass(frozen=True)
-class GeneratedScenes:
-    """Scenes rendered when they are asked for."""
-
-    source: SceneSource
-    count: int
-    categories: tuple[str, ...]
-    """The model's categories: what the labels are numbered by."""
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> SceneTruth:
-        return truth_of_rendered(self.source.render(index), self.categories)
-
-
-def truth_of_rendered(rendered: Rendered, categories: Sequence[str]) -> SceneTruth:
-    """Labels of a rendered scene as arrays; a category the model does not know is -1."""
-    labels, n = rendered.labels, len(rendered.labels)
-    return SceneTruth(
-        image=rendered.image,
-        intrinsics=rendered.intrinsics,
-        box=np.array([label.box for label in labels]).reshape(n, 4),
-        category=np.array([_label(label.category, categories) for label in labels], dtype=np.int64),
-        R_camera_object=np.array([label.R_camera_object for label in labels]).reshape(n, 3, 3),
-        position=np.array([label.position for label in labels]).reshape(n, 3),
-        symmetry=np.array([label.symmetry for label in labels], dtype=np.int64),
-        visibility=np.array([label.visibility for label in labels], dtype=np.float64),
-        voxels=np.array([label.item.voxels for label in labels], dtype=np.uint8).reshape(n, -1 if n else 0),
-    )
-
-
-def _label(category: str, categories: Sequence[str]) -> int:
-    return categories.index(category) if category in categories else -1
-
-
-def open_scenes(config: EvaluateConfig, model: ObservationModel) -> Scenes:
-    """The scenes the configuration asks for. Raises `InputError` when there are none."""
+    Raises:
+        InputError: there are none, or both a folder and shapes or photographs to generate from are given.
+    """
     if config.count < 1:
         raise input_error("number of scenes", got=config.count, expected="at least 1")
-    categories = model.config.categories
+    categories = model_config.categories
+    if config.scenes is not None:
+        if config.cad is not None or config.backgrounds is not None:
+            raise input_error("scenes of a folder and what to generate others from", do="leave out --cad and --backgrounds")
+        return FolderScenes(SceneFolder(config.scenes, categories, size=model_config.image_size), config.count)
     cad = None
     if config.cad is not None:
         from nolbo_ppl.data.cad import load_cad_folder
 
         cad = tuple(load_cad_folder(config.cad, categories))
     source = SceneSource(
-        preset(config.difficulty, model.config.image_size), seed=config.seed, cad=cad,
+        preset(config.difficulty, model_config.image_size), seed=config.seed, cad=cad,
         backgrounds=None if config.backgrounds is None else str(config.backgrounds),
     )  # fmt: skip
     return GeneratedScenes(source, config.count, categories)
@@ -221,26 +187,28 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def evaluate(config: EvaluateConfig) -> Evaluation:
+def run(config: EvaluateConfig) -> Evaluation:
     """Measure the model and write `metrics.json` and, unless switched off, the plots and examples into `config.out`."""
     model = load(config.model)
-    scenes = open_scenes(config, model)
+    scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
     write_json(config.out / "metrics.json", metrics(evaluation, config))
     if config.pictures:
-        from nolbo_ppl.viz.evaluation import write_examples, write_plots
+        from nolbo_ppl.viz.evaluation import write_plots
+        from nolbo_ppl.viz.examples import write_examples
 
         write_plots(evaluation.objects, evaluation.detections, evaluation.categories, model.config.symmetry, config.out)
         write_examples(evaluation.objects, scenes, model, config.out / "examples.png")
     return evaluation
 
 
-def main(config: EvaluateConfig) -> None:
-    """Run the verb and print the table."""
-    sys.stdout.write(table(evaluate(config)) + f"\n\nwritten to {config.out}\n")
+def main(args: Sequence[str] | None = None) -> None:
+    """Command line: parse the options, run, print the figures."""
+    import tyro
+
+    config = tyro.cli(EvaluateConfig, args=args, prog="nolbo evaluate", description=__doc__)
+    sys.stdout.write(table(run(config)) + f"\n\nwritten to {config.out}\n")
 
 
 if __name__ == "__main__":
-    import tyro
-
-    main(tyro.cli(EvaluateConfig))
+    main()

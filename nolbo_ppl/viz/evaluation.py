@@ -101,7 +101,8 @@ def _diagram(axes: Axes, diagram: Reliability, title: str) -> None:
         markersize=4.5, elinewidth=1.0, capsize=2, zorder=3, label="frequency, 95 %",
     )  # fmt: skip
     error = np.nansum(np.abs(diagram.frequency - diagram.confidence) * diagram.count) / max(diagram.count.sum(), 1)
-    axes.set(xlim=(0, 1), ylim=(0, 1.03), xlabel="stated probability", ylabel="frequency", title=f"{title}: ECE {error:.3f}")
+    axes.set(xlim=(0, 1), ylim=(0, 1.03), xlabel="stated probability", ylabel="frequency")
+    axes.set_title(f"{title}: ECE {error:.3f}")
     axes.legend(loc="upper left")
     grid(axes)
 
@@ -155,8 +156,8 @@ def draw_viewpoint(objects: ObjectRecords, categories: Sequence[str], symmetry: 
         azimuth = np.degrees(objects.azimuth_error)
         azimuth = azimuth[plain & np.isfinite(azimuth)]
         axes[1].hist(azimuth, bins=np.arange(-180, 181, 6), color="#4e79a7")
-        axes[1].set(xlim=(-180, 180), xticks=np.arange(-180, 181, 60), xlabel="azimuth error, degrees", ylabel="objects")
-        axes[1].set(yscale="symlog", title="signed azimuth error")
+        axes[1].set(xlim=(-180, 180), xticks=np.arange(-180, 181, 60), xlabel="azimuth error, degrees")
+        axes[1].set(yscale="symlog", ylabel="objects", title="signed azimuth error")
         axes[1].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         grid(axes[1], "y")
         _by_category(axes[2], objects, error, categories, symmetry)
@@ -182,7 +183,8 @@ def _cumulative(axes: Axes, error: Float[np.ndarray, " n"]) -> None:
 
 
 def _by_category(
-    axes: Axes, objects: ObjectRecords, error: Float[np.ndarray, " n"], categories: Sequence[str], symmetry: Sequence[int]
+    axes: Axes, objects: ObjectRecords, error: Float[np.ndarray, " n"], categories: Sequence[str],
+    symmetry: Sequence[int],
 ) -> None:
     """Boxes of the errors of each category: median, middle half, 5 to 95 %."""
     for k, name in enumerate(categories):

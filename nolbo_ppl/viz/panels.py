@@ -25,10 +25,9 @@ def draw_classes(axes: Axes, observations: Observations, index: int) -> None:
     """Bars of the most probable categories; a dot marks the one of maximum likelihood over the prior means."""
     posterior = observations.class_posterior[index]
     best = np.argsort(-posterior, kind="stable")[:SHOWN]
-    names = [observations.categories[k] for k in best]
-    row = np.arange(len(best))
-    axes.barh(row, posterior[best], height=0.62, color=[category_colour(n, observations.categories) for n in names])
-    for y, k in zip(row, best):
+    colours = [category_colour(observations.categories[k], observations.categories) for k in best]
+    axes.barh(np.arange(len(best)), posterior[best], height=0.62, color=colours)
+    for y, k in enumerate(best):
         probability = posterior[k]
         likeliest = observations.categories[k] == observations.category[index]
         text = f"{observations.categories[k]} {probability:.2f}" + (" •" if likeliest else "")

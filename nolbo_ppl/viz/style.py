@@ -47,7 +47,7 @@ def styled() -> Iterator[None]:
     """Draw with the library's style; matplotlib's own settings come back afterwards."""
     import matplotlib
 
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(_RC):  # type: ignore[arg-type]
         yield
 
 
