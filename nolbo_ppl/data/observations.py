@@ -29,7 +29,7 @@ MAXIMUM_DISTANCE = 1e5
 class ObservationTable:
     """Detections of objects in camera frames; NaN where a field is missing. Rows keep the order of the file."""
 
-    frame: Int[np.ndarray, "n"]
+    frame: Int[np.ndarray, " n"]
     """Row of the odometry, from 0."""
     position: Float[np.ndarray, "n 3"]
     """Position of the object in the camera frame, m."""
@@ -37,19 +37,19 @@ class ObservationTable:
     """Covariance of the position in the camera frame, m^2; NaN: to be estimated."""
     rotation: Float[np.ndarray, "n 3 3"]
     """R_camera_object; NaN: the detector gives none."""
-    rotation_scale: Float[np.ndarray, "n"]
+    rotation_scale: Float[np.ndarray, " n"]
     """Standard deviation of each angle of the rotation, rad; NaN: to be estimated."""
     latent: Float[np.ndarray, "n d"]
     """Shape latent; d may be 0; a row of NaN where missing."""
     latent_scale: Float[np.ndarray, "n d"]
     """Its standard deviation; NaN: to be estimated."""
-    objectness: Float[np.ndarray, "n"]
+    objectness: Float[np.ndarray, " n"]
     """Probability that this is an object at all, q(o)."""
     category: tuple[str | None, ...]
     """Category name or None."""
     size: Float[np.ndarray, "n 3"]
     """Extent in m, NaN where missing."""
-    symmetry: Int[np.ndarray, "n"]
+    symmetry: Int[np.ndarray, " n"]
     """Order of the symmetry about the object's vertical axis (0 free); -1: that of the category."""
     id: tuple[str, ...]
     """Identifiers; the row number where the file had none."""
@@ -63,12 +63,12 @@ class ObservationTable:
         return self.latent.shape[1]
 
     @property
-    def has_rotation(self) -> Bool[np.ndarray, "n"]:
+    def has_rotation(self) -> Bool[np.ndarray, " n"]:
         """Rows with an orientation."""
         return np.isfinite(self.rotation[:, 0, 0])
 
     @property
-    def has_latent(self) -> Bool[np.ndarray, "n"]:
+    def has_latent(self) -> Bool[np.ndarray, " n"]:
         """Rows with a latent."""
         return np.isfinite(self.latent).all(axis=1) & (self.latent_dim > 0)
 
@@ -183,7 +183,7 @@ def check_table(table: ObservationTable, frames: int) -> None:
     residual = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2), initial=0)
     refuse(~(residual < 1e-3) | (np.linalg.det(rotation) < 0), "rotation is no rotation", rotation, "orthonormal")
     for name in ("rotation_scale", "latent_scale"):
-        scale = getattr(table, name).reshape(len(table), -1)
+        scale = getattr(table, name).reshape(len(table), -1 if len(table) else 0)
         bad = ((scale <= 0) | np.isinf(scale)).any(axis=1)
         refuse(bad, f"{name} is not a positive number", scale, "greater than 0")
     refuse(np.isinf(table.latent).any(axis=1), "latent is not finite", table.latent, "finite numbers")

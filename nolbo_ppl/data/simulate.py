@@ -67,7 +67,7 @@ class World:
     """World positions, m."""
     rotation: Float[np.ndarray, "m 3 3"]
     """R_world_object; upright, z up."""
-    category: Int[np.ndarray, "m"]
+    category: Int[np.ndarray, " m"]
     """Category index."""
     latent: Float[np.ndarray, "m d"]
     """Shape latent."""
@@ -85,7 +85,7 @@ class Drive:
     """Drifting T_world_camera."""
     observations: ObservationTable
     """Detections."""
-    object_of: Int[np.ndarray, "k"]
+    object_of: Int[np.ndarray, " k"]
     """True object of each detection, -1 for clutter."""
     world: World | None = None
     """The objects, where they are known."""
@@ -145,7 +145,7 @@ def simulate_odometry(
 
 def simulate_detections(
     truth: Float[np.ndarray, "n 4 4"], world: World, config: DetectorConfig, rng: np.random.Generator
-) -> tuple[ObservationTable, Int[np.ndarray, "k"]]:
+) -> tuple[ObservationTable, Int[np.ndarray, " k"]]:
     """Detections of every frame in order, and the true object of each (-1 clutter).
 
     Noise of a position is isotropic with scale `position_scale + position_ratio * range`. Latents of clutter are drawn

@@ -23,7 +23,7 @@ class Trajectory:
 
     T_world_camera: Float[np.ndarray, "n 4 4"]
     """Body-to-world poses; camera x right, y down, z forward."""
-    times: Float[np.ndarray, "n"] | None = None
+    times: Float[np.ndarray, " n"] | None = None
     """Time stamps in seconds (TUM only)."""
     format: TrajectoryFormat = "kitti"
     """The format it was read in, used again to write."""
@@ -117,7 +117,7 @@ def write_trajectory(path: str | PathLike[str], trajectory: Trajectory) -> None:
 
 
 def match_times(
-    reference: Float[np.ndarray, "n"], other: Float[np.ndarray, "m"], tolerance: float = 0.02
+    reference: Float[np.ndarray, " n"], other: Float[np.ndarray, " m"], tolerance: float = 0.02
 ) -> tuple[np.ndarray, np.ndarray]:
     """Indices of rows of both whose times agree within `tolerance` seconds, each row used once at most."""
     nearest = np.clip(np.searchsorted(other, reference), 1, max(len(other) - 1, 1))

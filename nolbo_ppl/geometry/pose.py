@@ -136,12 +136,12 @@ def se3_log(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6"]:
     return np.concatenate([omega, np.einsum("...ij,...j->...i", V_inverse, T[..., :3, 3])], axis=-1)
 
 
-def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "..."]:
+def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, ...]:
     """Geodesic angle of rotations in rad, `||log R||_F / sqrt 2`, accurate near zero and near pi."""
     return np.linalg.norm(so3_log(R), axis=-1)
 
 
-def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, "n"] | None = None) -> np.ndarray:
+def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, n] | None = None) -> np.ndarray:
     """Chordal mean of rotations."""
     return nearest_rotation(np.average(R, axis=0, weights=weights))
 

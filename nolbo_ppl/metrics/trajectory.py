@@ -25,14 +25,14 @@ class ErrorSummary:
     min: float
     max: float
     count: int
-    errors: Float[np.ndarray, "n"]
+    errors: Float[np.ndarray, " n"]
 
     def as_dict(self) -> dict[str, float]:
         """The numbers without the raw errors, for a summary file."""
         return {k: float(getattr(self, k)) for k in ("rmse", "mean", "median", "std", "min", "max", "count")}
 
 
-def summarise(errors: Float[np.ndarray, "n"]) -> ErrorSummary:
+def summarise(errors: Float[np.ndarray, " n"]) -> ErrorSummary:
     """Statistics of non-negative errors."""
     e = np.asarray(errors, dtype=np.float64)
     return ErrorSummary(
@@ -43,7 +43,7 @@ def summarise(errors: Float[np.ndarray, "n"]) -> ErrorSummary:
 
 def umeyama(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], with_scale: bool = False
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]:
     """Rotation, translation and scale with `target ~ scale * R source + t` in least squares (Umeyama 1991, eq. 38-42).
 
     Points on a line or in one place leave rotations free: one of the best is returned, always a proper rotation.

@@ -28,7 +28,7 @@ class Converted:
     """Detections."""
     objects: tuple[str | None, ...]
     """True object of each detection; None for clutter."""
-    trusted: Bool[np.ndarray, "n"]
+    trusted: Bool[np.ndarray, " n"]
     """Rows whose truth can be relied on."""
     T_world_object: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """True poses of static objects, where known."""

@@ -22,7 +22,7 @@ def planar_poses(states: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]
     return make_pose(R, np.stack([-states[:, 1], np.zeros(len(states)), states[:, 0]], axis=1))
 
 
-def longest_run(mask: Bool[np.ndarray, "n"]) -> tuple[int, int]:
+def longest_run(mask: Bool[np.ndarray, " n"]) -> tuple[int, int]:
     """First and one past the last index of the longest run of True; the whole range when there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     starts, ends = edges[::2], edges[1::2]
@@ -32,7 +32,7 @@ def longest_run(mask: Bool[np.ndarray, "n"]) -> tuple[int, int]:
     return int(starts[best]), int(ends[best])
 
 
-def car_rotation(rotation_y: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
+def car_rotation(rotation_y: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 3"]:
     """R_camera_object of cars: KITTI's rotation_y in the object frame of PASCAL3D+ (front -y, z up)."""
     c, s, zero = np.cos(rotation_y), np.sin(rotation_y), np.zeros_like(rotation_y)
     front = np.stack([c, zero, -s], axis=1)
@@ -76,7 +76,7 @@ def read_labels(path: str | PathLike[str]) -> tuple[Int[np.ndarray, "k 2"], Floa
 
 def parked_tracks(
     numbers: Int[np.ndarray, "k 2"], poses: Float[np.ndarray, "k 4"], kinds: list[str], truth: Float[np.ndarray, "n 4 4"],
-    trusted: Bool[np.ndarray, "n"], limit: float = 1.0,
+    trusted: Bool[np.ndarray, " n"], limit: float = 1.0,
 ) -> dict[int, np.ndarray]:
     """Median world position of cars whose label stays within `limit` m of it in four fifths of its trusted frames."""
     out = {}

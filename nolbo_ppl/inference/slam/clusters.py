@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from nolbo_ppl.inference.slam.graph import Links
-from nolbo_ppl.inference.slam.state import SlamState
+from nolbo_ppl.inference.slam.state_types import SlamState
 
 
 def frames_of_landmarks(state: SlamState) -> list[frozenset[int]]:
@@ -17,7 +17,7 @@ def frames_of_landmarks(state: SlamState) -> list[frozenset[int]]:
     return [frozenset(f) for f in frames]
 
 
-def join(links: Links, frames: list[frozenset[int]], minimum: float) -> Int[np.ndarray, "m"]:
+def join(links: Links, frames: list[frozenset[int]], minimum: float) -> Int[np.ndarray, " m"]:
     """Cluster of every landmark, numbered by its earliest member: links above `minimum`, strongest first.
 
     A link that would put two tracklets of one frame together is passed over.
@@ -45,6 +45,6 @@ def join(links: Links, frames: list[frozenset[int]], minimum: float) -> Int[np.n
     return np.unique(roots, return_inverse=True)[1].astype(np.int64) if m else roots
 
 
-def clusters_of(state: SlamState) -> Int[np.ndarray, "m"]:
+def clusters_of(state: SlamState) -> Int[np.ndarray, " m"]:
     """Cluster of every landmark under the links in use."""
     return join(state.links, frames_of_landmarks(state), state.config.merge_weight)

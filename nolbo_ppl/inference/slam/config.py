@@ -107,13 +107,13 @@ class SlamProblem:
 class NoiseModel:
     """The standard deviations in use, after estimation and correction."""
 
-    rotation_step: Float[np.ndarray, "n-1"]
+    rotation_step: Float[np.ndarray, " n-1"]
     """Standard deviation of each angle of each odometry step, rad."""
-    translation_step: Float[np.ndarray, "n-1"]
+    translation_step: Float[np.ndarray, " n-1"]
     """Standard deviation of each coordinate of each odometry step, m."""
     position_covariance: Float[np.ndarray, "k 3 3"]
     """Covariance of every observed position in its camera frame, m^2."""
-    rotation_scale: Float[np.ndarray, "k"]
+    rotation_scale: Float[np.ndarray, " k"]
     """Standard deviation of every observed angle, rad."""
     latent_scale: Float[np.ndarray, "k d"]
     """Standard deviation of every latent coordinate."""
@@ -125,3 +125,7 @@ class NoiseModel:
     """Estimated values by name."""
     warnings: tuple[str, ...] = ()
     """Stated scales found too small, in words."""
+    position_factor: float = 1.0
+    """Factor on position covariances in the graph, for errors that resemble one another from frame to frame."""
+    rotation_factor: float = 1.0
+    """The same for orientations."""

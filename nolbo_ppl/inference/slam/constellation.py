@@ -34,9 +34,9 @@ FEATURE_MINIMUM = -6.0
 class Closing:
     """A group of pairs accepted together."""
 
-    a: Int[np.ndarray, "c"]
+    a: Int[np.ndarray, " c"]
     """Newer tracklets."""
-    b: Int[np.ndarray, "c"]
+    b: Int[np.ndarray, " c"]
     """Older tracklets."""
     log_odds: float
     """Joint log evidence above new landmarks, nats."""
@@ -127,7 +127,7 @@ def find_closing(
     return Closing(pairs.a[members], pairs.b[members], best, best - rival)
 
 
-def windows(first: Int[np.ndarray, "m"], size: int) -> list[Int[np.ndarray, "w"]]:
+def windows(first: Int[np.ndarray, " m"], size: int) -> list[Int[np.ndarray, " w"]]:
     """Groups of tracklets that follow each other in time, each half overlapping the next."""
     order = np.argsort(first, kind="stable")
     if len(order) <= size:
@@ -137,7 +137,7 @@ def windows(first: Int[np.ndarray, "m"], size: int) -> list[Int[np.ndarray, "w"]
 
 
 def close_constellations(
-    pairs: Pairs, first: Int[np.ndarray, "m"], estimate: Estimate, samples: PosteriorSamples, config: SlamConfig,
+    pairs: Pairs, first: Int[np.ndarray, " m"], estimate: Estimate, samples: PosteriorSamples, config: SlamConfig,
     *, inflation: float, floor: float, log_new: float,
 ) -> list[Closing]:
     """Closings of every window that pass, best first, no tracklet closed twice in different ways."""

@@ -18,8 +18,9 @@ from nolbo_ppl.inference.slam.clusters import clusters_of
 from nolbo_ppl.inference.slam.constellation import close_constellations
 from nolbo_ppl.inference.slam.evidence import Pairs, candidate_pairs, posterior_samples
 from nolbo_ppl.inference.slam.graph import Links, add_links, linearise, optimise
+from nolbo_ppl.inference.slam.odometry import refine_odometry
 from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation
-from nolbo_ppl.inference.slam.state import SlamState, base_graph, inlier_weights, refine_odometry
+from nolbo_ppl.inference.slam.state import SlamState, base_graph, inlier_weights
 
 LINK_ROTATION = 0.05
 """Scale of the rotation between two linked landmarks that are oriented, rad."""
@@ -47,7 +48,7 @@ class StepInfo:
     """Half the sum of squared whitened residuals after the M-step."""
 
 
-def make_links(state: SlamState, a: Int[np.ndarray, "l"], b: Int[np.ndarray, "l"], weight: np.ndarray) -> Links:
+def make_links(state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"], weight: np.ndarray) -> Links:
     """Links between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
     R = state.estimate.T_world_landmark[:, :3, :3]
     T = np.tile(np.eye(4), (len(a), 1, 1))

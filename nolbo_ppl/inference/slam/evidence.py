@@ -29,17 +29,17 @@ class TrackletFeatures:
     """Posterior mean of the latent."""
     latent_variance: Float[np.ndarray, "m d"]
     """Its variance; LARGE_VARIANCE where none was observed."""
-    log_population: Float[np.ndarray, "m"]
+    log_population: Float[np.ndarray, " m"]
     """Log density of its latent in the population of the others."""
-    category: Int[np.ndarray, "m"]
+    category: Int[np.ndarray, " m"]
     """Most frequent category, -1 for none."""
-    symmetry: Int[np.ndarray, "m"]
+    symmetry: Int[np.ndarray, " m"]
     """Symmetry order."""
-    oriented: Bool[np.ndarray, "m"]
+    oriented: Bool[np.ndarray, " m"]
     """Whether its orientation was observed."""
-    first: Int[np.ndarray, "m"]
+    first: Int[np.ndarray, " m"]
     """First frame."""
-    last: Int[np.ndarray, "m"]
+    last: Int[np.ndarray, " m"]
     """Last frame."""
 
 
@@ -57,13 +57,13 @@ class PosteriorSamples:
 class Pairs:
     """Candidate pairs of a newer and an older tracklet."""
 
-    a: Int[np.ndarray, "p"]
+    a: Int[np.ndarray, " p"]
     """Newer tracklet."""
-    b: Int[np.ndarray, "p"]
+    b: Int[np.ndarray, " p"]
     """Older tracklet."""
-    log_position: Float[np.ndarray, "p"]
+    log_position: Float[np.ndarray, " p"]
     """Log density of the position gap, m^-3."""
-    log_feature: Float[np.ndarray, "p"]
+    log_feature: Float[np.ndarray, " p"]
     """Log ratio of latent, category and orientation against the population."""
 
     def select(self, rows: np.ndarray) -> Pairs:
@@ -74,7 +74,7 @@ class Pairs:
         return len(self.a)
 
 
-def log_population(latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m"]:
+def log_population(latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:
     """Log density of each latent in the kernel mixture `1/(M-1) sum_c N(.; c, own + c's variance)` of all others."""
     m, d = latent.shape
     out = np.zeros(m)
@@ -98,7 +98,7 @@ def posterior_samples(
 
 
 def gap_covariance(
-    samples: PosteriorSamples, a: Int[np.ndarray, "p"], b: Int[np.ndarray, "p"]
+    samples: PosteriorSamples, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
 ) -> Float[np.ndarray, "p 3 3"]:
     """Covariance of the position of a less that of b, m^2."""
     out = np.empty((len(a), 3, 3))
@@ -152,8 +152,8 @@ def candidate_pairs(
 
 def feature_log_ratio(
     estimate: Estimate, samples: PosteriorSamples, features: TrackletFeatures, prior: FeaturePrior, config: SlamConfig,
-    a: Int[np.ndarray, "p"], b: Int[np.ndarray, "p"],
-) -> Float[np.ndarray, "p"]:
+    a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
     """Log ratio of a's latent, category and orientation given that it is b to those of any object, nats."""
     ratio = prior.category_log_ratio(features.category[b], features.category[a])
     if features.latent.shape[1]:

@@ -23,18 +23,18 @@ LARGE_VARIANCE = 1e12
 class FeaturePrior:
     """Population of latents and categories, in its simplest form (one Gaussian, one histogram)."""
 
-    mean: Float[np.ndarray, "d"]
+    mean: Float[np.ndarray, " d"]
     """Mean latent."""
-    variance: Float[np.ndarray, "d"]
+    variance: Float[np.ndarray, " d"]
     """Its variance over all detections."""
     categories: tuple[str, ...]
     """Category names in use."""
-    log_frequency: Float[np.ndarray, "c"]
+    log_frequency: Float[np.ndarray, " c"]
     """Log share of each category."""
     category_error: float
     """Probability that a category is wrong."""
 
-    def category_log_ratio(self, a: Int[np.ndarray, "p"], b: Int[np.ndarray, "p"]) -> Float[np.ndarray, "p"]:
+    def category_log_ratio(self, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """`log p(b | a, same object) - log p(b)`; 0 where either is missing (-1)."""
         if not self.categories:
             return np.zeros(len(a))
@@ -46,7 +46,7 @@ class FeaturePrior:
     def pair_log_ratio(
         self, latent_a: np.ndarray, variance_a: np.ndarray, category_a: np.ndarray, latent_b: np.ndarray,
         variance_b: np.ndarray, category_b: np.ndarray,
-    ) -> Float[np.ndarray, "p"]:
+    ) -> Float[np.ndarray, " p"]:
         """Log ratio of a's features given b to those of any object, nats.
 
         With latents at hand an equal category adds nothing (it is read off the same latent), a different one counts.
@@ -60,7 +60,7 @@ class FeaturePrior:
         return np.where(known, latent + np.minimum(category, 0.0), category)
 
 
-def latent_log_density(x: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> Float[np.ndarray, "..."]:
+def latent_log_density(x: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> Float[np.ndarray, " ..."]:
     """Log density of a diagonal Gaussian, summed over the last axis."""
     return -0.5 * np.sum((x - mean) ** 2 / variance + np.log(2 * np.pi * variance), axis=-1)
 
@@ -77,7 +77,7 @@ def fit_prior(table: ObservationTable, config: SlamConfig) -> FeaturePrior:
     return FeaturePrior(mean, variance, tuple(str(c) for c in categories), np.log(shares), config.category_error)
 
 
-def category_index(table: ObservationTable, prior: FeaturePrior) -> Int[np.ndarray, "n"]:
+def category_index(table: ObservationTable, prior: FeaturePrior) -> Int[np.ndarray, " n"]:
     """Index of each detection's category, -1 where it has none or one the prior does not know."""
     lookup = {name: i for i, name in enumerate(prior.categories)}
     return np.array([lookup.get(c, -1) if c is not None else -1 for c in table.category], dtype=np.int64).reshape(len(table))
@@ -85,7 +85,7 @@ def category_index(table: ObservationTable, prior: FeaturePrior) -> Int[np.ndarr
 
 def detection_features(
     table: ObservationTable, noise: NoiseModel, prior: FeaturePrior
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Int[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
     """Latent, its variance (very large where missing) and category index of every detection."""
     known = table.has_latent[:, None]
     latent = np.where(known, np.nan_to_num(table.latent), prior.mean)
@@ -102,8 +102,8 @@ def fuse_latent(
 
 
 def weighted_latents(
-    latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, "n"],
-    weight: Float[np.ndarray, "n"], groups: int,
+    latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"], groups: int,
 ) -> tuple[Float[np.ndarray, "g d"], Float[np.ndarray, "g d"]]:
     """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu, corrected:
     positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get LARGE_VARIANCE.
@@ -120,8 +120,8 @@ def weighted_latents(
 
 
 def latent_population_log_ratio(
-    latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"], a: Int[np.ndarray, "p"], b: Int[np.ndarray, "p"]
-) -> Float[np.ndarray, "p"]:
+    latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"], a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
+) -> Float[np.ndarray, " p"]:
     """Log ratio of tracklet a's latent given that of b to its density in the population of all other tracklets.
 
     The population is the kernel mixture `1/M sum_c N(a; c, variance_a + variance_c)` over every tracklet but a.

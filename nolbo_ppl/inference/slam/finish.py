@@ -13,13 +13,13 @@ from nolbo_ppl.inference.slam.em import make_links
 from nolbo_ppl.inference.slam.evidence import candidate_pairs, posterior_samples
 from nolbo_ppl.inference.slam.graph import Estimate, Links, linearise, optimise
 from nolbo_ppl.inference.slam.observe import Associations, associate_detections
+from nolbo_ppl.inference.slam.odometry import refine_odometry
 from nolbo_ppl.inference.slam.state import (
     SlamState,
     base_graph,
     first_estimate,
     inlier_weights,
     linearise_state,
-    refine_odometry,
     tracklet_features,
 )
 
@@ -38,7 +38,7 @@ def surviving_links(state: SlamState) -> Links:
     return Links(links.a[keep], links.b[keep], links.weight[keep], links.T_a_b[keep], links.scale[keep])
 
 
-def relabel(state: SlamState, cluster: Int[np.ndarray, "m"]) -> SlamState:
+def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
     """The same problem with landmarks joined: numbering, features, first positions from the current poses."""
     count = int(cluster.max(initial=-1)) + 1
     landmark = cluster[state.landmark]
@@ -132,6 +132,6 @@ def final_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     return base_graph(state)
 
 
-def weight_totals(associations: Associations, landmarks: int) -> Float[np.ndarray, "m"]:
+def weight_totals(associations: Associations, landmarks: int) -> Float[np.ndarray, " m"]:
     """Sum of the association weights of each landmark."""
     return np.bincount(associations.landmark, weights=associations.weight, minlength=landmarks)

@@ -10,7 +10,7 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 def squared_distance(
     error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]
-) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+) -> tuple[Float[np.ndarray, " ..."], Float[np.ndarray, " ..."]]:
     """Squared Mahalanobis distance and `log |2 pi S|` of symmetric positive definite S, by cofactors."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 0, 2]
     d, e, f = covariance[..., 1, 1], covariance[..., 1, 2], covariance[..., 2, 2]
@@ -22,7 +22,7 @@ def squared_distance(
     return np.maximum(square, 0.0), np.log(determinant) + 3.0 * LOG_2PI
 
 
-def log_normal(error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "..."]:
+def log_normal(error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."]:
     """Log density of N(error; 0, S), per m^3."""
     square, log_det = squared_distance(error, covariance)
     return -0.5 * (square + log_det)

@@ -46,15 +46,15 @@ class Estimate:
 class ObservationFactors:
     """Relative pose measurements of landmarks, ready for the graph."""
 
-    frame: Int[np.ndarray, "k"]
+    frame: Int[np.ndarray, " k"]
     """Pose each hangs on."""
-    landmark: Int[np.ndarray, "k"]
+    landmark: Int[np.ndarray, " k"]
     """Landmark each hangs on."""
     T_camera_landmark: Float[np.ndarray, "k 4 4"]
     """Measured pose, symmetry and flips resolved."""
     covariance: Float[np.ndarray, "k 6 6"]
     """Covariance [rotation, position] in the measured landmark's frame, rad^2 and m^2."""
-    weight: Float[np.ndarray, "k"]
+    weight: Float[np.ndarray, " k"]
     """Frozen weight."""
 
 
@@ -62,11 +62,11 @@ class ObservationFactors:
 class Links:
     """Soft equality of two landmarks."""
 
-    a: Int[np.ndarray, "l"]
+    a: Int[np.ndarray, " l"]
     """Newer landmark."""
-    b: Int[np.ndarray, "l"]
+    b: Int[np.ndarray, " l"]
     """Older landmark."""
-    weight: Float[np.ndarray, "l"]
+    weight: Float[np.ndarray, " l"]
     """Probability that both are one object."""
     T_a_b: Float[np.ndarray, "l 4 4"]
     """Identity, or the half turn or symmetry between the two landmarks' frames."""
@@ -93,8 +93,8 @@ def landmark_key(j: int) -> int:
 
 
 def resolve_observations(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, estimate: Estimate, rows: Int[np.ndarray, "k"],
-    landmark: Int[np.ndarray, "k"], weight: Float[np.ndarray, "k"],
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, estimate: Estimate, rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"],
 ) -> ObservationFactors:
     """Measured relative poses of the given detections: the orientation mode nearest to the estimate, loose where none.
 
@@ -120,10 +120,10 @@ def resolve_observations(
         oriented[o[lost]] = False
         observed[o[lost]] = predicted[o[lost]]
     covariance = np.zeros((len(rows), 6, 6))
-    angular = np.where(oriented, scale, LOOSE_ROTATION)
+    angular = np.where(oriented, scale * np.sqrt(noise.rotation_factor), LOOSE_ROTATION)
     covariance[:, [0, 1, 2], [0, 1, 2]] = (angular**2)[:, None]
     covariance[oriented & (symmetry == 0), 2, 2] = LOOSE_ROTATION**2
-    covariance[:, 3:, 3:] = np.swapaxes(observed, 1, 2) @ noise.position_covariance[rows] @ observed
+    covariance[:, 3:, 3:] = noise.position_factor * (np.swapaxes(observed, 1, 2) @ noise.position_covariance[rows] @ observed)
     return ObservationFactors(frame, landmark, make_pose(observed, table.position[rows]), covariance, weight)
 
 
@@ -241,7 +241,7 @@ class Linearisation:
         delta = self.factor.solve(self.jacobian.T @ noise).reshape(-1, 6, count)
         return delta[self.landmarks :], delta[: self.landmarks]
 
-    def covariance(self, blocks: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 6 6"]:
+    def covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 6"]:
         """Marginal covariances of the given blocks (landmark j: j; pose i: landmarks + i)."""
         out = np.empty((len(blocks), 6, 6))
         size = self.jacobian.shape[1]

@@ -15,7 +15,7 @@ from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation, resolved
 MAD_TO_SCALE = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 
-DEFAULT_ROTATION_STEP = 0.005
+DEFAULT_ROTATION_STEP = 0.004
 """Standard deviation of each angle of an odometry step where nothing is stated, rad (refined on the graph)."""
 DEFAULT_TRANSLATION_RATIO = 0.02
 """The same for its translation, m per m."""
@@ -27,9 +27,9 @@ TOO_SMALL = 1.35
 class DetectionPairs:
     """Detections of (very likely) the same object in two consecutive frames."""
 
-    first: Int[np.ndarray, "p"]
+    first: Int[np.ndarray, " p"]
     """Rows of the earlier detections."""
-    second: Int[np.ndarray, "p"]
+    second: Int[np.ndarray, " p"]
     """Rows of the later ones."""
     residual: Float[np.ndarray, "p 3"]
     """Position of the second less the first carried over by odometry, in the second camera frame, m."""
@@ -72,13 +72,13 @@ def _without_strangers(pairs: DetectionPairs) -> DetectionPairs:
     return DetectionPairs(pairs.first[keep], pairs.second[keep], pairs.residual[keep])
 
 
-def robust_scale(values: Float[np.ndarray, "n"]) -> float:
+def robust_scale(values: Float[np.ndarray, " n"]) -> float:
     """Standard deviation of the bulk about zero by the median absolute value; NaN without values."""
     return float(MAD_TO_SCALE * np.median(np.abs(values))) if len(values) else float("nan")
 
 
 def fit_range_model(
-    distance: Float[np.ndarray, "n"], value: Float[np.ndarray, "n"], bins: int = 4
+    distance: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"], bins: int = 4
 ) -> tuple[float, float]:
     """Standard deviation `a + b * range` of single detections from differences `value` of two, by range quantile.
 
@@ -99,7 +99,7 @@ def fit_range_model(
 
 
 def ray_covariance(
-    position: Float[np.ndarray, "n 3"], lateral: Float[np.ndarray, "n"], radial: Float[np.ndarray, "n"]
+    position: Float[np.ndarray, "n 3"], lateral: Float[np.ndarray, " n"], radial: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
     """Covariance with one scale along the ray and another across it, m^2."""
     distance = np.linalg.norm(position, axis=1, keepdims=True)
@@ -135,8 +135,8 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
 
 
 def odometry_scales(
-    length: Float[np.ndarray, "n"], config: SlamConfig
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    length: Float[np.ndarray, " n"], config: SlamConfig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances."""
     typical = float(np.sqrt(np.mean(length**2))) if len(length) else 1.0
     typical = max(typical, 1e-3)

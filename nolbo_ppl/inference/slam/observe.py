@@ -24,17 +24,17 @@ GATE = 25.0
 class Associations:
     """Marginal association of every detection, sparse: rows of the table, landmark numbers, probabilities."""
 
-    row: Int[np.ndarray, "p"]
+    row: Int[np.ndarray, " p"]
     """Detection of each entry."""
-    landmark: Int[np.ndarray, "p"]
+    landmark: Int[np.ndarray, " p"]
     """Landmark of each entry."""
-    weight: Float[np.ndarray, "p"]
+    weight: Float[np.ndarray, " p"]
     """Its probability."""
-    new: Float[np.ndarray, "k"]
+    new: Float[np.ndarray, " k"]
     """Probability of each detection being an object the map does not hold."""
-    background: Float[np.ndarray, "k"]
+    background: Float[np.ndarray, " k"]
     """Probability of each detection being no object."""
-    log_evidence: Float[np.ndarray, "f"]
+    log_evidence: Float[np.ndarray, " f"]
     """Log evidence of each frame with detections, nats."""
     exact: bool
     """Whether every frame was summed exactly."""

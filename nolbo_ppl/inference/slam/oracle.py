@@ -17,7 +17,7 @@ from nolbo_ppl.inference.slam.tracklets import Tracklets
 
 
 def solve_with_associations(
-    problem: SlamProblem, object_of: Int[np.ndarray, "k"], config: SlamConfig | None = None, noise: NoiseModel | None = None,
+    problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig | None = None, noise: NoiseModel | None = None,
 ) -> SlamState:
     """Solve the graph with given associations (-1: leave out), all weights one, no kernels.
 

@@ -14,7 +14,7 @@ UNIFORM_LOG_DENSITY = -np.log(8.0 * np.pi**2)
 _MAXIMUM_ORDER = 8
 
 
-def resolved_symmetry(table: ObservationTable, config: SlamConfig) -> Int[np.ndarray, "n"]:
+def resolved_symmetry(table: ObservationTable, config: SlamConfig) -> Int[np.ndarray, " n"]:
     """Symmetry order of every observation: its own, else its category's, else none (1)."""
     by_category = np.array([config.category_symmetry.get(c, 1) if c else 1 for c in table.category], dtype=np.int64)
     return np.where(table.symmetry >= 0, table.symmetry, by_category.reshape(len(table)))
@@ -36,7 +36,7 @@ def _free_alignment(R_predicted: np.ndarray, R_observed: np.ndarray) -> np.ndarr
 
 
 def nearest_mode_rotation(
-    R_predicted: Float[np.ndarray, "n 3 3"], R_observed: Float[np.ndarray, "n 3 3"], symmetry: Int[np.ndarray, "n"]
+    R_predicted: Float[np.ndarray, "n 3 3"], R_observed: Float[np.ndarray, "n 3 3"], symmetry: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
     """The equivalent of each observed rotation (symmetry, half turn) that is closest to the predicted one."""
     out = R_observed.copy()
@@ -54,9 +54,9 @@ def nearest_mode_rotation(
 
 
 def orientation_log_density(
-    R_predicted: Float[np.ndarray, "n 3 3"], R_observed: Float[np.ndarray, "n 3 3"], scale: Float[np.ndarray, "n"],
-    symmetry: Int[np.ndarray, "n"], config: SlamConfig,
-) -> Float[np.ndarray, "n"]:
+    R_predicted: Float[np.ndarray, "n 3 3"], R_observed: Float[np.ndarray, "n 3 3"], scale: Float[np.ndarray, " n"],
+    symmetry: Int[np.ndarray, " n"], config: SlamConfig,
+) -> Float[np.ndarray, " n"]:
     """Log density of observed rotations: a mixture over symmetry, half turns and a uniform part, rad^-3.
 
     Each mode is normal in the rotation vector; a free axis is integrated out (its angle is uniform).

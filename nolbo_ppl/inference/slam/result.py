@@ -16,7 +16,7 @@ from nolbo_ppl.inference.slam.finish import final_graph
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import Linearisation, linearise
 from nolbo_ppl.inference.slam.observe import Associations
-from nolbo_ppl.inference.slam.state import SlamState
+from nolbo_ppl.inference.slam.state_types import SlamState
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Landmark:
     """Probability that it is an object at all."""
     class_posterior: dict[str, float]
     """Probability of each category; empty where none was reported."""
-    latent: Float[np.ndarray, "d"] | None
+    latent: Float[np.ndarray, " d"] | None
     """Posterior mean of the shape latent from all views."""
-    latent_variance: Float[np.ndarray, "d"] | None
+    latent_variance: Float[np.ndarray, " d"] | None
     """Its variance."""
-    size: Float[np.ndarray, "3"] | None
+    size: Float[np.ndarray, " 3"] | None
     """Weighted mean extent, m."""
     detections: float
     """Sum of its association weights."""
@@ -79,7 +79,7 @@ class SlamResult:
         """The final graph linearised at the answer."""
         return linearise(final_graph(self.state), self.state.estimate)
 
-    def pose_covariances(self, rows: Int[np.ndarray, "r"] | None = None) -> Float[np.ndarray, "r 6 6"]:
+    def pose_covariances(self, rows: Int[np.ndarray, " r"] | None = None) -> Float[np.ndarray, "r 6 6"]:
         """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed."""
         rows = np.arange(len(self.T_world_camera)) if rows is None else np.asarray(rows, dtype=np.int64)
         if len(rows) and (rows.min() < 0 or rows.max() >= len(self.T_world_camera)):
@@ -124,7 +124,7 @@ class SlamResult:
         np.add.at(summed, state.landmark[known], state.weight[known, None] * size[known])
         return [summed[j] / total[j] if total[j] > 0 else None for j in range(len(total))]
 
-    def existence(self) -> Float[np.ndarray, "m"]:
+    def existence(self) -> Float[np.ndarray, " m"]:
         """Probability that each landmark is an object rather than background seen again and again.
 
         Log odds: `log lambda_new + sum_k w_k [log q(o_k) + log N(x_k; l)] + log |2 pi Sigma_l|^1/2` (the landmark's

@@ -1,14 +1,15 @@
-"""State of the EM: what is fixed for a drive, and what an iteration changes. `init` builds it."""
+"""`init`: scales, tracklets, and the graph of odometry and tracklets solved for the first time."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import inverse, make_pose, se3_log, skew, transform
+from nolbo_ppl.geometry.pose import inverse, make_pose, transform
+from nolbo_ppl.inference.slam.calibration import calibrate
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.evidence import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fit_prior, weighted_latents
@@ -25,68 +26,18 @@ from nolbo_ppl.inference.slam.graph import (
     optimise,
     resolve_observations,
 )
-from nolbo_ppl.inference.slam.noise import TOO_SMALL, estimate_noise
+from nolbo_ppl.inference.slam.noise import estimate_noise
+from nolbo_ppl.inference.slam.odometry import odometry_by_evidence, stated_scales
 from nolbo_ppl.inference.slam.orientation import orientation_log_density, resolved_symmetry
+from nolbo_ppl.inference.slam.state_types import SlamState
 from nolbo_ppl.inference.slam.tracklets import Tracklets, build_tracklets
 
-REFINEMENTS = 3
-"""Iterations that refine odometry scales nobody stated."""
-
-
-@dataclass(frozen=True)
-class SlamState:
-    """Everything an iteration reads and returns."""
-
-    problem: SlamProblem
-    """Odometry and observations."""
-    config: SlamConfig
-    """Settings."""
-    noise: NoiseModel
-    """Scales in use."""
-    prior: FeaturePrior
-    """Population of features."""
-    tracklets: Tracklets
-    """Short-term tracks, numbered with moving ones."""
-    static: Int[np.ndarray, "m"]
-    """Tracks that are landmarks of the graph."""
-    rows: Int[np.ndarray, "k"]
-    """Detections in the graph."""
-    landmark: Int[np.ndarray, "k"]
-    """Landmark (index into `static`) of each of them."""
-    weight: Float[np.ndarray, "k"]
-    """Their weights: probability of being that object rather than background."""
-    features: TrackletFeatures
-    """Features of the landmarks."""
-    estimate: Estimate
-    """Poses and landmarks."""
-    links: Links
-    """Weighted links in use."""
-    typical_range: float
-    """Median range of detections, m."""
-    iteration: int = 0
-    """Iterations done."""
-    closing: bool = True
-    """Whether constellation rounds still run."""
-    graph_error: float = 0.0
-    """Half the sum of squared whitened residuals of the last M-step."""
-    closed: dict[int, int] = field(default_factory=dict)
-    """Tracklets closed by constellation, newer to older."""
-
-    @property
-    def link_scale(self) -> float:
-        """How much one object's measured position varies between passes, m: half the typical detection scale."""
-        return link_scale(self.noise)
-
-
-def link_scale(noise: NoiseModel) -> float:
-    """Half the median scale of a detected position, m."""
-    if not len(noise.position_covariance):
-        return 0.1
-    return 0.5 * float(np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3))
+RETRACK = 2.5
+"""Growth of an odometry scale beyond which objects are tracked anew."""
 
 
 def first_estimate(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, rows: Int[np.ndarray, "k"], landmark: Int[np.ndarray, "k"],
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, rows: Int[np.ndarray, " k"], landmark: Int[np.ndarray, " k"],
     landmarks: int,
 ) -> Estimate:
     """Landmarks at the weighted mean of their detections in the odometry frame, oriented as most of them agree."""
@@ -122,7 +73,7 @@ def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def inlier_weights(state: SlamState) -> Float[np.ndarray, "k"]:
+def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     """Probability of each detection in the graph being its object rather than background, given the estimate.
 
     Odds are objectness times the density of the position about the prediction, against the clutter density. This is how
@@ -140,8 +91,8 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, "k"]:
 
 
 def tracklet_features(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior, rows: Int[np.ndarray, "k"],
-    landmark: Int[np.ndarray, "k"], weight: Float[np.ndarray, "k"], landmarks: int,
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior, rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"], landmarks: int,
 ) -> TrackletFeatures:
     """Latent posterior, category, symmetry and life span of each landmark from its detections."""
     table = problem.observations
@@ -170,51 +121,6 @@ def linearise_state(state: SlamState) -> Linearisation:
     return linearise(graph, state.estimate)
 
 
-def refine_odometry(state: SlamState, linearisation: Linearisation, *, only_warn: bool = False) -> SlamState:
-    """One EM update of the odometry scales: the mean square residual of a step over the posterior, `E[r^2]`.
-
-    The expectation is over samples of the linearised graph: `r = r0 + d_i+1 - Ad d_i`. Stated scales are left as they
-    are unless found too small (and `correct_scales`); either is reported.
-    """
-    config, noise = state.config, state.noise
-    n = len(state.problem)
-    if n < 3 or not len(state.rows):
-        return state
-    rng = np.random.default_rng(config.seed + 7919)
-    delta, _ = linearisation.samples(min(config.samples, 32), rng)
-    T = state.estimate.T_world_camera
-    step = inverse(T[:-1]) @ T[1:]
-    measured = inverse(state.problem.odometry[:-1]) @ state.problem.odometry[1:]
-    mean = se3_log(inverse(measured) @ step)
-    back = inverse(step)
-    R, t = back[:, :3, :3], back[:, :3, 3]
-    adjoint = np.zeros((n - 1, 6, 6))
-    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
-    adjoint[:, 3:, :3] = skew(t) @ R
-    change = delta[1:] - adjoint @ delta[:-1]
-    square = mean**2 + np.mean(change**2, axis=2)
-    rotation = float(np.sqrt(np.mean(square[:, :3] / noise.rotation_step[:, None] ** 2)))
-    translation = float(np.sqrt(np.mean(square[:, 3:] / noise.translation_step[:, None] ** 2)))
-    report, warnings = dict(noise.report), list(noise.warnings)
-    stated_rotation = config.odometry_rotation_scale is not None
-    stated_translation = (config.odometry_translation_scale, config.odometry_translation_ratio) != (None, None)
-    factors = []
-    for name, stated, ratio in (("rotation", stated_rotation, rotation), ("translation", stated_translation, translation)):
-        if not stated and not only_warn:
-            factors.append(ratio)
-        elif stated and ratio > TOO_SMALL:
-            text = f"stated odometry {name} scale is too small: residuals are {ratio:.2f} times as wide"
-            warnings = [w for w in warnings if not w.startswith(f"stated odometry {name}")] + [text]
-            factors.append(ratio if config.correct_scales else 1.0)
-        else:
-            factors.append(1.0)
-    noise = replace(noise, rotation_step=noise.rotation_step * factors[0], translation_step=noise.translation_step * factors[1],
-                    report=report, warnings=tuple(warnings))
-    report["odometry_rotation_scale"] = float(np.median(noise.rotation_step))
-    report["odometry_translation_scale"] = float(np.median(noise.translation_step))
-    return replace(state, noise=noise)
-
-
 def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
     """Scales, tracklets, and the graph of odometry and tracklets solved once; no loop is closed yet.
 
@@ -225,7 +131,15 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
     noise = estimate_noise(problem, config)
     prior = fit_prior(problem.observations, config)
     tracklets = build_tracklets(problem, noise, config, prior)
-    return init_from_tracklets(problem, config, noise, prior, tracklets)
+    state = init_from_tracklets(problem, config, noise, prior, tracklets)
+    if all(stated_scales(config)) or not len(tracklets):
+        return state
+    # Tracks were broken where the default scales were much too small: track once more with the better ones.
+    growth = np.median(state.noise.rotation_step / noise.rotation_step), np.median(state.noise.translation_step / noise.translation_step)
+    if max(growth) < RETRACK:
+        return state
+    noise = replace(noise, rotation_step=state.noise.rotation_step, translation_step=state.noise.translation_step)
+    return init_from_tracklets(problem, config, noise, prior, build_tracklets(problem, noise, config, prior))
 
 
 def init_from_tracklets(
@@ -246,12 +160,12 @@ def init_from_tracklets(
         estimate=first_estimate(problem, noise, config, rows, landmark, len(static)), links=Links.none(),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
     )
-    unstated = config.odometry_rotation_scale is None or (
-        config.odometry_translation_scale is None and config.odometry_translation_ratio is None)
-    for repeat in range(1 + (REFINEMENTS if unstated else 1)):
+    for repeat in range(3):
         estimate, _, error = optimise(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
         state = replace(state, estimate=estimate, graph_error=error)
+        if repeat == 0:
+            state = calibrate(state)
         state = replace(state, weight=inlier_weights(state))
-        state = refine_odometry(state, linearise_state(state))
-    estimate, _, error = optimise(base_graph(state), state.estimate, iterations=4)
-    return replace(state, estimate=estimate, graph_error=error)
+        if repeat == 0:
+            state = odometry_by_evidence(state)
+    return state

@@ -27,17 +27,17 @@ GATE = 30.0
 class Tracklets:
     """Short-term tracks and the detections they are made of."""
 
-    of_observation: Int[np.ndarray, "k"]
+    of_observation: Int[np.ndarray, " k"]
     """Track of each detection, -1 for none."""
-    weight: Float[np.ndarray, "k"]
+    weight: Float[np.ndarray, " k"]
     """Marginal probability of that assignment within its frame."""
-    first: Int[np.ndarray, "m"]
+    first: Int[np.ndarray, " m"]
     """Frame of the first detection."""
-    last: Int[np.ndarray, "m"]
+    last: Int[np.ndarray, " m"]
     """Frame of the last one."""
-    count: Int[np.ndarray, "m"]
+    count: Int[np.ndarray, " m"]
     """Number of detections."""
-    moving: Bool[np.ndarray, "m"]
+    moving: Bool[np.ndarray, " m"]
     """Tracks of objects that move."""
 
     def __len__(self) -> int:
@@ -77,10 +77,10 @@ class Tracker:
 
     def associate(
         self, position: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"],
-        R_world_object: Float[np.ndarray, "n 3 3"], rotation_scale: Float[np.ndarray, "n"], symmetry: Int[np.ndarray, "n"],
-        latent: Float[np.ndarray, "n d"], latent_variance: Float[np.ndarray, "n d"], category: Int[np.ndarray, "n"],
-        objectness: Float[np.ndarray, "n"], frame: int,
-    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        R_world_object: Float[np.ndarray, "n 3 3"], rotation_scale: Float[np.ndarray, " n"], symmetry: Int[np.ndarray, " n"],
+        latent: Float[np.ndarray, "n d"], latent_variance: Float[np.ndarray, "n d"], category: Int[np.ndarray, " n"],
+        objectness: Float[np.ndarray, " n"], frame: int,
+    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1: background."""
         n, m = len(position), len(self.index)
         log_likelihood = np.full((n, m), -np.inf)
@@ -185,7 +185,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
 
 
 def summarise_tracks(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, assigned: Int[np.ndarray, "k"], weight: Float[np.ndarray, "k"]
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, assigned: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"]
 ) -> Tracklets:
     """First and last frame, length, and a motion test of every track; short tracks are dissolved, numbers are repacked."""
     table = problem.observations
@@ -204,8 +204,8 @@ def summarise_tracks(
 
 
 def moving_tracks(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, assigned: Int[np.ndarray, "k"], tracks: int
-) -> Bool[np.ndarray, "m"]:
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, assigned: Int[np.ndarray, " k"], tracks: int
+) -> Bool[np.ndarray, " m"]:
     """Tracks whose positions are explained much better by a constant velocity than by rest.
 
     The evidence is the fall of the weighted sum of squares when each coordinate is given a slope in time, less half a log
