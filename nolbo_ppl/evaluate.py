@@ -84,7 +84,7 @@ def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
     categories = model_config.categories
     if config.scenes is not None:
         if config.cad is not None or config.backgrounds is not None:
-            raise input_error("scenes of a folder and what to generate others from", do="leave out --cad and --backgrounds")
+            raise input_error("a folder of scenes and what to generate others from", do="drop --cad, --backgrounds")
         return FolderScenes(SceneFolder(config.scenes, categories, size=model_config.image_size), config.count)
     cad = None
     if config.cad is not None:
