@@ -10,20 +10,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.clusters import clusters_of
+from nolbo_ppl.inference.slam.config import SlamConfig
 from nolbo_ppl.inference.slam.constellation import close_constellations
-from nolbo_ppl.inference.slam.evidence import Pairs, candidate_pairs, posterior_samples
-from nolbo_ppl.inference.slam.graph import Links, add_links, linearise, optimise
+from nolbo_ppl.inference.slam.evidence import Pairs, TrackletFeatures, candidate_pairs, posterior_samples
+from nolbo_ppl.inference.slam.graph import LOOSE_ROTATION, Links, add_links, linearise, optimise
 from nolbo_ppl.inference.slam.odometry import refine_odometry
 from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation
-from nolbo_ppl.inference.slam.state import SlamState, base_graph, inlier_weights
+from nolbo_ppl.inference.slam.state import base_graph, inlier_weights
+from nolbo_ppl.inference.slam.state_types import SlamState
 
 LINK_ROTATION = 0.05
 """Scale of the rotation between two linked landmarks that are oriented, rad."""
+CONTRADICTION = 0.7
+"""Linked orientations farther apart than this, in every mode, say nothing, rad."""
 
 
 @dataclass(frozen=True)
@@ -48,45 +52,58 @@ class StepInfo:
     """Half the sum of squared whitened residuals after the M-step."""
 
 
-def make_links(state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"], weight: np.ndarray) -> Links:
+def link_arrays(
+    R: Float[np.ndarray, "m 3 3"], features: TrackletFeatures, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"],
+    weight: Float[np.ndarray, " l"], position_scale: float,
+) -> Links:
     """Links between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
-    R = state.estimate.T_world_landmark[:, :3, :3]
     T = np.tile(np.eye(4), (len(a), 1, 1))
-    scale = np.tile([10.0, state.link_scale], (len(a), 1))
-    both = np.flatnonzero(state.features.oriented[a] & state.features.oriented[b]
-                          & (state.features.symmetry[a] != 0) & (state.features.symmetry[b] != 0))
+    scale = np.tile([LOOSE_ROTATION, position_scale], (len(a), 1))
+    both = np.flatnonzero(features.oriented[a] & features.oriented[b] & (features.symmetry[a] != 0)
+                          & (features.symmetry[b] != 0))
     if len(both):
         i, j = a[both], b[both]
-        turned = nearest_mode_rotation(R[i], R[j], state.features.symmetry[j])
+        turned = nearest_mode_rotation(R[i], R[j], features.symmetry[j])
         # L_b = L_a * T_a_b: when L_b turned by M looks like L_a, then R_a = R_b M and T_a_b = M'.
         T[both] = make_pose(np.swapaxes(turned, 1, 2) @ R[j], np.zeros(3))
         scale[both, 0] = LINK_ROTATION
         error = np.arccos(np.clip((np.einsum("lij,lij->l", R[i], turned) - 1) / 2, -1, 1))
-        scale[both[error > 0.7], 0] = 10.0  # orientations that contradict each other say nothing
+        scale[both[error > CONTRADICTION], 0] = LOOSE_ROTATION
     return Links(a, b, weight, T, scale)
 
 
-def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
+def make_links(state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"], weight: np.ndarray) -> Links:
+    """`link_arrays` of a state."""
+    return link_arrays(state.estimate.T_world_landmark[:, :3, :3], state.features, a, b, weight, state.link_scale)
+
+
+def groups_seen_together(first: Int[np.ndarray, " m"], last: Int[np.ndarray, " m"], limit: int = 16) -> list[np.ndarray]:
+    """Tracklets in the order of their first frames, cut into groups that overlap in time one with all."""
+    order = np.argsort(first, kind="stable")
+    out, start = [], 0
+    while start < len(order):
+        end, least_last = start + 1, last[order[start]]
+        while end < len(order) and first[order[end]] <= least_last and end - start < limit:
+            least_last = min(least_last, last[order[end]])
+            end += 1
+        out.append(order[start:end])
+        start = end
+    return out
+
+
+def soft_assignment(
+    pairs: Pairs, features: TrackletFeatures, cluster: Int[np.ndarray, " m"], log_new: float, config: SlamConfig
+) -> tuple[Int[np.ndarray, " l"], Int[np.ndarray, " l"], Float[np.ndarray, " l"], float]:
     """E-step: marginals of every group of tracklets seen together over the older clusters or a new landmark.
 
     Tracklets seen in one frame are different objects, so within a group the association is one-to-one; a cluster (what
-    earlier iterations hold to be one object) stands as one candidate, by its best member.
+    earlier iterations hold to be one object) stands as one candidate, by its best member. Returns newer tracklets, older
+    ones, weights, and the log evidence above all tracklets being new.
     """
-    cluster = clusters_of(state)
-    log_new = float(np.log(state.noise.new_rate))
     order = np.argsort(pairs.a, kind="stable")
     sorted_a = pairs.a[order]
-    by_first = np.argsort(state.features.first, kind="stable")
-    first, last = state.features.first, state.features.last
     a_out, b_out, w_out, evidence = [], [], [], 0.0
-    start = 0
-    while start < len(by_first):
-        end, least_last = start + 1, last[by_first[start]]
-        while end < len(by_first) and first[by_first[end]] <= least_last and end - start < 16:
-            least_last = min(least_last, last[by_first[end]])
-            end += 1
-        group = by_first[start:end]
-        start = end
+    for group in groups_seen_together(features.first, features.last):
         spans = [order[np.searchsorted(sorted_a, i, "left"):np.searchsorted(sorted_a, i, "right")] for i in group]
         rows = np.concatenate(spans)
         if not len(rows):
@@ -99,16 +116,24 @@ def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
         for k in np.argsort(value, kind="stable"):  # ascending: the best member of a cluster stays
             log_likelihood[row_of[k], column[k]] = value[k]
             chosen[row_of[k], column[k]] = pairs.b[rows[k]]
-        marginals = association_marginals(log_likelihood, np.full(len(group), log_new), associator=state.config.associator)
+        marginals = association_marginals(log_likelihood, np.full(len(group), log_new), associator=config.associator)
         evidence += marginals.log_evidence - len(group) * log_new
-        i, j = np.nonzero(np.asarray(marginals.weights) > state.config.link_minimum)
+        weights = np.asarray(marginals.weights)
+        i, j = np.nonzero(weights > config.link_minimum)
         a_out.append(group[i])
         b_out.append(chosen[i, j])
-        w_out.append(np.asarray(marginals.weights)[i, j])
+        w_out.append(weights[i, j])
     if not a_out:
-        return Links.none(), 0.0
-    a, b, w = np.concatenate(a_out), np.concatenate(b_out), np.minimum(np.concatenate(w_out), 1.0)
-    return make_links(state, a, b, w), evidence
+        empty = np.zeros(0, dtype=np.int64)
+        return empty, empty, np.zeros(0), 0.0
+    return np.concatenate(a_out), np.concatenate(b_out), np.minimum(np.concatenate(w_out), 1.0), evidence
+
+
+def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
+    """The E-step of a state as links, and its log evidence."""
+    a, b, weight, evidence = soft_assignment(pairs, state.features, clusters_of(state), float(np.log(state.noise.new_rate)),
+                                             state.config)
+    return make_links(state, a, b, weight), evidence
 
 
 def step(state: SlamState) -> tuple[SlamState, StepInfo]:

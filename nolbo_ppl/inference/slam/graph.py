@@ -152,13 +152,13 @@ def add_observation_factors(graph: gtsam.NonlinearFactorGraph, factors: Observat
 
 
 def add_landmark_priors(
-    graph: gtsam.NonlinearFactorGraph, T_world_landmark: Float[np.ndarray, "m 4 4"], typical_range: float
+    graph: gtsam.NonlinearFactorGraph, T_world_landmark: Float[np.ndarray, "m 4 4"], typical_range: float, first: int = 0
 ) -> None:
-    """Weak prior on each landmark, so that no system is ever indeterminate."""
+    """Weak prior on each landmark (numbered from `first`), so that no system is ever indeterminate."""
     sigmas = np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [PRIOR_POSITION_RATIO * max(typical_range, 1e-3)] * 3)
     model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     for j, T in enumerate(T_world_landmark):
-        graph.add(gtsam.PriorFactorPose3(landmark_key(j), gtsam.Pose3(T), model))
+        graph.add(gtsam.PriorFactorPose3(landmark_key(first + j), gtsam.Pose3(T), model))
 
 
 def add_links(graph: gtsam.NonlinearFactorGraph, links: Links, robust_width: float | None) -> None:
@@ -189,7 +189,7 @@ def from_values(values: gtsam.Values, poses: int, landmarks: int) -> Estimate:
     return Estimate(camera, landmark)
 
 
-def _named(error: RuntimeError) -> GraphError:
+def named_error(error: RuntimeError) -> GraphError:
     """Turn GTSAM's complaint into one that names the variable."""
     text = " ".join(str(error).split())
     return GraphError(f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)")
@@ -213,7 +213,7 @@ def optimise(
         result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
         after = graph.error(result)
     except RuntimeError as error:
-        raise _named(error) from None
+        raise named_error(error) from None
     if not np.isfinite(after) or after > before:
         return estimate, before, before
     return from_values(result, len(estimate.T_world_camera), len(estimate.T_world_landmark)), before, after
@@ -269,7 +269,7 @@ def linearise(graph: gtsam.NonlinearFactorGraph, estimate: Estimate) -> Linearis
     try:
         rows, columns, entries = graph.linearize(to_values(estimate)).sparseJacobian_()
     except RuntimeError as error:
-        raise _named(error) from None
+        raise named_error(error) from None
     size = 6 * (len(estimate.T_world_camera) + len(estimate.T_world_landmark))
     jacobian = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))[:, :size]
     normal = (jacobian.T @ jacobian).tocsc()

@@ -74,7 +74,7 @@ def orientation_log_density(
             out[rows] = np.logaddexp(np.log1p(-config.orientation_outlier) + log_mode, outlier)
             continue
         turns = vertical_turns(int(order))
-        group = order if order % 2 else order
+        group = int(order)
         weight = np.full(len(turns), config.flip_probability / max(len(turns) - group, 1))
         weight[:group] = (1 - (config.flip_probability if len(turns) > group else 0.0)) / group
         error = so3_log(np.swapaxes(predicted, 1, 2)[:, None] @ observed[:, None] @ turns[None])

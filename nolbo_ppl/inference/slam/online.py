@@ -1,0 +1,423 @@
+"""Online SLAM: a keyframe at a time on iSAM2, loops closed as tracks end, the batch map at the end.
+
+Each keyframe costs one association of its detections with live tracks, one iSAM2 update, and the read-out of one pose.
+Every few ended tracks one window of them is matched to all older ones (constellation first, the soft E-step for the rest)
+under the covariance of a coarse drift graph. `finish` hands tracks and closings to the batch EM for the final map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from jaxtyping import Float
+
+from nolbo_ppl.data.observations import ObservationTable, concatenate
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
+from nolbo_ppl.inference.slam.clusters import join
+from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.constellation import find_closing
+from nolbo_ppl.inference.slam.drift import DriftGraph
+from nolbo_ppl.inference.slam.em import link_arrays, soft_assignment
+from nolbo_ppl.inference.slam.evidence import PosteriorSamples, TrackletFeatures, candidate_pairs, log_population
+from nolbo_ppl.inference.slam.features import detection_features, fit_prior, fuse_latent
+from nolbo_ppl.inference.slam.finish import finish
+from nolbo_ppl.inference.slam.graph import (
+    GAUGE_SCALE,
+    Estimate,
+    Links,
+    add_landmark_priors,
+    add_observation_factors,
+    landmark_key,
+    named_error,
+    pose_key,
+    resolve_observations,
+)
+from nolbo_ppl.inference.slam.noise import estimate_noise
+from nolbo_ppl.inference.slam.orientation import resolved_symmetry
+from nolbo_ppl.inference.slam.result import SlamResult
+from nolbo_ppl.inference.slam.solve import iterate
+from nolbo_ppl.inference.slam.state import init, init_from_tracklets
+from nolbo_ppl.inference.slam.state_types import link_scale
+from nolbo_ppl.inference.slam.tracklets import Tracker, summarise_tracks
+
+SURE = 0.9
+"""Soft links above this weight are closed online; the rest waits for `finish`."""
+
+
+@dataclass
+class Track:
+    """A track as the online system keeps it."""
+
+    rows: list[int]
+    """Its detections."""
+    landmark: int
+    """Landmark in the graph, -1 while it is too short."""
+    latent: Float[np.ndarray, " d"]
+    """Fused latent."""
+    latent_variance: Float[np.ndarray, " d"]
+    """Its variance."""
+    category: int
+    """Category of the first detection."""
+    symmetry: int
+    """Its symmetry."""
+    oriented: bool
+    """Whether it is oriented."""
+    first: int
+    """First frame."""
+    last: int
+    """Last frame."""
+    R: Float[np.ndarray, "3 3"]
+    """Orientation in the odometry's world frame."""
+
+
+@dataclass(frozen=True)
+class OnlineInfo:
+    """What one keyframe did."""
+
+    frame: int
+    """Its number."""
+    T_world_camera: Float[np.ndarray, "4 4"]
+    """Current pose."""
+    landmarks: int
+    """Landmarks in the graph."""
+    closings: int
+    """Links closed at this keyframe."""
+
+
+class ObjectSlam:
+    """Object SLAM fed keyframe by keyframe: `update(odometry, observations)`, then `finish()`.
+
+    Scales that the configuration does not state are taken from a reference problem (the first part of a drive, or an
+    earlier one of the same sensors) given as `calibration`; without one they are the defaults.
+    """
+
+    def __init__(self, config: SlamConfig | None = None, calibration: SlamProblem | None = None) -> None:
+        self.config = config or SlamConfig()
+        self.calibration = calibration
+        self.reference: NoiseModel | None = None
+        self.tracker: Tracker | None = None
+        self.odometry: list[np.ndarray] = []
+        self.tables: list[ObservationTable] = []
+        self.frame_of: list[int] = []
+        self.assigned: list[np.ndarray] = []
+        self.weights: list[np.ndarray] = []
+        self.tracks: dict[int, Track] = {}
+        self.track_of_landmark: list[int] = []
+        self.links: list[tuple[int, int]] = []
+        self.drift = DriftGraph()
+        self.fresh: list[int] = []
+        self.pending: dict[int, list[tuple[int, SlamProblem, NoiseModel, int]]] = {}
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.values = gtsam.Values()
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(0.05)
+        parameters.relinearizeSkip = 5
+        # Landmarks hang on weak priors beside a nearly fixed first pose: QR takes that spread, Cholesky does not.
+        parameters.setFactorization("QR")
+        self.isam = gtsam.ISAM2(parameters)
+        self.T_world_camera = np.eye(4)
+        self.seen = 0
+
+    # -- one keyframe -------------------------------------------------------------------------------------------------
+
+    def update(self, odometry: Float[np.ndarray, "4 4"], observations: ObservationTable) -> OnlineInfo:
+        """Take the next keyframe.
+
+        Args:
+            odometry: its T_world_camera as odometry has it.
+            observations: its detections; their frame numbers are ignored.
+
+        Raises:
+            InputError: odometry or observations are malformed.
+        """
+        odometry = np.asarray(odometry, dtype=np.float64)
+        if odometry.shape != (4, 4) or not np.isfinite(odometry).all() or not is_rotation(odometry[:3, :3]):
+            raise input_error("odometry is no pose", got=odometry, expected="a finite 4 x 4 rigid motion")
+        frame = len(self.odometry)
+        table = replace(observations, frame=np.zeros(len(observations), dtype=np.int64))
+        problem = SlamProblem(odometry[None], table)  # checks the detections
+        self._begin(table)
+        noise = self._noise(problem)
+        rotation, translation = self._add_pose(odometry, frame)
+        assigned, weight = self._track(table, noise, odometry, frame, rotation, translation)
+        start = self.seen
+        self.odometry.append(odometry)
+        self.tables.append(replace(table, frame=np.full(len(table), frame, dtype=np.int64)))
+        self.assigned.append(assigned)
+        self.weights.append(weight)
+        self.seen += len(table)
+        self._remember(table, noise, assigned, start, odometry, frame)
+        self._add_factors(problem, noise, assigned, odometry, frame)
+        self._commit()
+        self.T_world_camera = self.isam.calculateEstimatePose3(pose_key(frame)).matrix()
+        closings = self._close(frame, noise)
+        if closings:
+            self.T_world_camera = self.isam.calculateEstimatePose3(pose_key(frame)).matrix()
+        return OnlineInfo(frame, self.T_world_camera, len(self.track_of_landmark), closings)
+
+    def _begin(self, table: ObservationTable) -> None:
+        """At the first keyframe: scales of the reference, and the prior of features."""
+        if self.tracker is not None:
+            return
+        if self.calibration is not None:
+            state = init(self.calibration, self.config)
+            reference, self.prior = state.noise, state.prior
+            report = reference.report
+            config = self.config
+            ratio = config.odometry_translation_ratio
+            constant = config.odometry_translation_scale
+            if ratio is None and constant is None:
+                length = np.linalg.norm(np.diff(self.calibration.odometry[:, :3, 3], axis=0), axis=1)
+                ratio = float(np.median(reference.translation_step) / max(np.median(length), 1e-9))
+                constant = 0.2 * float(np.median(reference.translation_step))
+            lateral, radial = report.get("position_lateral"), report.get("position_radial")
+            position, growth = config.position_scale, config.position_ratio
+            if position is None and growth is None and lateral is not None and radial is not None:
+                width = max(report.get("position_track_width", 1.0), 1.0) * 1.2
+                position = width * max(lateral, radial)
+                growth = width * max(report["position_lateral_ratio"], report["position_radial_ratio"])
+            self.config = replace(
+                config, odometry_rotation_scale=float(np.median(reference.rotation_step)), odometry_translation_ratio=ratio,
+                odometry_translation_scale=constant, position_scale=position, position_ratio=growth,
+                rotation_scale=config.rotation_scale or float(np.median(reference.rotation_scale)) if len(
+                    reference.rotation_scale) else config.rotation_scale,
+                latent_scale=config.latent_scale or (report.get("latent_scale") if "latent_scale" in report else None),
+                new_rate=reference.new_rate, clutter_rate=reference.clutter_rate)
+            self.factors = (reference.position_factor, reference.rotation_factor)
+        else:
+            self.prior = fit_prior(table, self.config)
+            self.factors = (1.0, 1.0)
+            rate = 1e-3
+            self.config = replace(self.config, new_rate=self.config.new_rate or rate,
+                                  clutter_rate=self.config.clutter_rate or 0.5 * rate)
+        self.tracker = Tracker(self.config, table.latent_dim, self.prior, float(self.config.new_rate or 1e-3),
+                               float(self.config.clutter_rate or 1e-3))
+
+    def _noise(self, problem: SlamProblem) -> NoiseModel:
+        noise = estimate_noise(problem, self.config)
+        return replace(noise, position_factor=self.factors[0], rotation_factor=self.factors[1])
+
+    def _add_pose(self, odometry: np.ndarray, frame: int) -> tuple[float, float]:
+        """Odometry factor and first value of the new pose; scales of the step."""
+        if frame == 0:
+            self.T_world_camera = odometry
+            self.graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(odometry),
+                                                  gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE)))
+            self.values.insert(pose_key(0), gtsam.Pose3(odometry))
+            return 0.0, 0.0
+        step = inverse(self.odometry[-1]) @ odometry
+        config, length = self.config, float(np.linalg.norm(step[:3, 3]))
+        rotation = config.odometry_rotation_scale or 0.004
+        constant, ratio = config.odometry_translation_scale, config.odometry_translation_ratio
+        if constant is None and ratio is None:
+            ratio = 0.02
+        translation = max(float(np.hypot(constant or 0.0, (ratio or 0.0) * length)), 1e-4)
+        self.T_world_camera = self.T_world_camera @ step
+        model = gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
+        self.graph.add(gtsam.BetweenFactorPose3(pose_key(frame - 1), pose_key(frame), gtsam.Pose3(step), model))
+        self.values.insert(pose_key(frame), gtsam.Pose3(self.T_world_camera))
+        self.drift.advance(self.T_world_camera, rotation, translation)
+        return rotation, translation
+
+    def _track(
+        self, table: ObservationTable, noise: NoiseModel, odometry: np.ndarray, frame: int, rotation: float, translation: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        tracker = self.tracker
+        assert tracker is not None
+        if frame:
+            tracker.predict(odometry, frame, rotation, translation)
+        if not len(table):
+            return np.zeros(0, dtype=np.int64), np.zeros(0)
+        R = odometry[:3, :3]
+        latent, variance, category = detection_features(table, noise, self.prior)
+        return tracker.associate(
+            transform(odometry, table.position), R @ noise.position_covariance @ R.T,
+            np.where(table.has_rotation[:, None, None], R @ np.nan_to_num(table.rotation), np.eye(3)),
+            np.where(table.has_rotation, noise.rotation_scale, np.nan), resolved_symmetry(table, self.config), latent, variance,
+            category, np.clip(table.objectness, *self.config.objectness_limits), frame)
+
+    def _remember(
+        self, table: ObservationTable, noise: NoiseModel, assigned: np.ndarray, start: int, odometry: np.ndarray, frame: int
+    ) -> None:
+        """Fuse features of each detection into its track."""
+        latent, variance, category = detection_features(table, noise, self.prior)
+        symmetry = resolved_symmetry(table, self.config)
+        for i, number in enumerate(assigned.tolist()):
+            if number < 0:
+                continue
+            if number not in self.tracks:
+                oriented = bool(table.has_rotation[i])
+                R = odometry[:3, :3] @ table.rotation[i] if oriented else np.eye(3)
+                self.tracks[number] = Track([start + i], -1, latent[i], variance[i], int(category[i]), int(symmetry[i]),
+                                            oriented, frame, frame, R)
+                continue
+            track = self.tracks[number]
+            track.rows.append(start + i)
+            track.last = frame
+            track.latent, track.latent_variance = fuse_latent(track.latent, track.latent_variance, latent[i], variance[i])
+
+    def _add_factors(
+        self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, odometry: np.ndarray, frame: int
+    ) -> None:
+        """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
+        for i, number in enumerate(assigned.tolist()):
+            if number < 0:
+                continue
+            track = self.tracks[number]
+            if track.landmark < 0 and len(track.rows) < self.config.track_minimum:
+                self.pending.setdefault(number, []).append((frame, problem, noise, i))
+                continue
+            if track.landmark < 0:
+                self._found(track, number, problem.observations, i)
+                for earlier, its_problem, its_noise, k in self.pending.pop(number, []):
+                    pose = self.isam.calculateEstimatePose3(pose_key(earlier)).matrix()
+                    self._observe(its_problem, its_noise, k, earlier, pose, track.landmark)
+            self._observe(problem, noise, i, frame, self.T_world_camera, track.landmark)
+        for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
+            del self.pending[number]
+
+    def _found(self, track: Track, number: int, table: ObservationTable, i: int) -> None:
+        """A new landmark at its latest detection, with its weak prior."""
+        track.landmark = len(self.track_of_landmark)
+        self.track_of_landmark.append(number)
+        self.fresh.append(track.landmark)
+        R = self.T_world_camera[:3, :3] @ table.rotation[i] if np.isfinite(table.rotation[i, 0, 0]) else np.eye(3)
+        T = make_pose(R, transform(self.T_world_camera, table.position[i]))
+        self.values.insert(landmark_key(track.landmark), gtsam.Pose3(T))
+        add_landmark_priors(self.graph, T[None], float(np.linalg.norm(table.position[i])), first=track.landmark)
+
+    def _observe(
+        self, problem: SlamProblem, noise: NoiseModel, i: int, frame: int, T_world_camera: np.ndarray, landmark: int
+    ) -> None:
+        estimate = Estimate(T_world_camera[None], self._landmark(landmark)[None])
+        factors = resolve_observations(problem, noise, self.config, estimate, np.array([i]), np.zeros(1, dtype=np.int64),
+                                       np.ones(1))
+        add_observation_factors(self.graph, replace(factors, frame=np.array([frame]), landmark=np.array([landmark])))
+
+    def _landmark(self, number: int) -> np.ndarray:
+        key = landmark_key(number)
+        if self.values.exists(key):
+            return self.values.atPose3(key).matrix()
+        return self.isam.calculateEstimatePose3(key).matrix()
+
+    def _commit(self) -> None:
+        try:
+            self.isam.update(self.graph, self.values)
+        except RuntimeError as error:
+            raise named_error(error) from None
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.values = gtsam.Values()
+
+    # -- loops --------------------------------------------------------------------------------------------------------
+
+    def _close(self, frame: int, noise: NoiseModel) -> int:
+        """Match the newest window of ended tracks once enough of them are new; returns the number of links added."""
+        ended = [j for j in self.fresh if frame - self.tracks[self.track_of_landmark[j]].last > 1]
+        half = max(self.config.constellation_size // 2, 1)
+        if len(ended) < half:
+            return 0
+        self.fresh = [j for j in self.fresh if j not in set(ended)]
+        m = len(self.track_of_landmark)
+        window = sorted(set(ended) | {j for j, _ in zip(range(min(ended) - 1, -1, -1), range(half))})
+        tracks = [self.tracks[number] for number in self.track_of_landmark]
+        features = TrackletFeatures(
+            latent=np.array([t.latent for t in tracks]), latent_variance=np.array([t.latent_variance for t in tracks]),
+            log_population=np.zeros(m), category=np.array([t.category for t in tracks]),
+            symmetry=np.array([t.symmetry for t in tracks]), oriented=np.array([t.oriented for t in tracks]),
+            first=np.array([t.first if j in set(window) else -1 for j, t in enumerate(tracks)]),
+            last=np.array([t.last for t in tracks]))
+        features = replace(features, log_population=log_population(features.latent, features.latent_variance))
+        poses = np.array([self._landmark(j) for j in range(m)])
+        estimate = Estimate(self.T_world_camera[None], poses)
+        rng = np.random.default_rng([self.config.seed, frame])
+        samples = self._samples(poses, tracks, noise, rng)
+        floor = link_scale(noise) if len(noise.position_covariance) else 0.1
+        pairs = candidate_pairs(estimate, samples, features, self.prior, self.config, inflation=1.0, floor=floor)
+        linked = {a for a, _ in self.links}
+        pairs = pairs.select(np.array([int(a) not in linked for a in pairs.a], dtype=bool))
+        log_new = float(np.log(5.0 * noise.new_rate))
+        outside = pairs.select(~np.isin(pairs.b, window))
+        closing = find_closing(outside, estimate, samples, self.config, inflation=1.0, floor=floor, log_new=log_new)
+        found: list[tuple[int, int]] = []
+        if closing and closing.log_odds > self.config.constellation_log_odds and (
+                closing.margin > self.config.constellation_log_odds / 2):
+            found += list(zip(closing.a.tolist(), closing.b.tolist()))
+        taken = {a for a, _ in found}
+        rest = pairs.select(np.array([int(a) not in taken for a in pairs.a], dtype=bool))
+        frames = [frozenset(range(t.first, t.last + 1)) for t in tracks]
+        known = np.array(self.links, dtype=np.int64).reshape(-1, 2)
+        cluster = join(Links(known[:, 0], known[:, 1], np.ones(len(known)), np.zeros((0, 4, 4)), np.zeros((0, 2))), frames, 0.5)
+        a, b, weight, _ = soft_assignment(rest, features, cluster, float(np.log(noise.new_rate)), self.config)
+        found += [(int(i), int(j)) for i, j, w in zip(a, b, weight) if w > SURE]
+        if found:
+            self._link(found, poses, features, tracks, floor)
+        return len(found)
+
+    def _link(
+        self, found: list[tuple[int, int]], poses: np.ndarray, features: TrackletFeatures, tracks: list[Track], scale: float
+    ) -> None:
+        pairs = np.array(found, dtype=np.int64)
+        links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
+        for k, (i, j) in enumerate(found):
+            model = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(links.scale[k], 3))
+            self.graph.add(gtsam.BetweenFactorPose3(landmark_key(i), landmark_key(j), gtsam.Pose3(links.T_a_b[k]), model))
+            self.drift.close((tracks[i].first + tracks[i].last) // 2, (tracks[j].first + tracks[j].last) // 2,
+                             poses[j, :3, 3], 2 * scale)
+        self.links += found
+        self._commit()
+        self.isam.update()
+
+    def _samples(
+        self, poses: np.ndarray, tracks: list[Track], noise: NoiseModel, rng: np.random.Generator
+    ) -> PosteriorSamples:
+        """Samples of all landmarks: the drift of their node, and the noise of their own detections."""
+        nodes = self.drift.samples(self.config.samples, rng)
+        middle = np.array([(t.first + t.last) // 2 for t in tracks])
+        error = nodes[self.drift.node(middle)]
+        position = poses[:, :3, 3]
+        moved = np.cross(error[:, :3], position[:, :, None], axis=1) + error[:, 3:]
+        own = np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3) if len(
+            noise.position_covariance) else 0.1
+        count = np.array([len(t.rows) for t in tracks])
+        spread = own / np.sqrt(count)
+        angle = (float(np.median(noise.rotation_scale)) if len(noise.rotation_scale) else 0.1) / np.sqrt(count)
+        return PosteriorSamples(moved + spread[:, None, None] * rng.standard_normal(moved.shape),
+                                error[:, :3] + angle[:, None, None] * rng.standard_normal(moved.shape))
+
+    # -- answers ------------------------------------------------------------------------------------------------------
+
+    def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
+        """All poses as iSAM2 has them now."""
+        values = self.isam.calculateEstimate()
+        return np.array([values.atPose3(pose_key(i)).matrix() for i in range(len(self.odometry))])
+
+    def finish(self) -> SlamResult:
+        """Batch EM on the tracks gathered: the final trajectory and map.
+
+        Raises:
+            InputError: no keyframe was given.
+        """
+        if not self.odometry:
+            raise input_error("no keyframe was given", do="call update first")
+        problem = SlamProblem(np.array(self.odometry), concatenate(self.tables))
+        noise = estimate_noise(problem, self.config)
+        prior = fit_prior(problem.observations, self.config)
+        tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
+        state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
+        state, infos = iterate(state)
+        state, associations = finish(state)
+        return SlamResult(state=state, associations=associations, infos=infos)
+
+
+def solve_online(problem: SlamProblem, config: SlamConfig | None = None, calibration_frames: int = 200) -> SlamResult:
+    """Feed a whole problem keyframe by keyframe; scales nobody stated come from its first frames."""
+    first = problem.observations.select(problem.observations.frame < calibration_frames)
+    slam = ObjectSlam(config, calibration=SlamProblem(problem.odometry[:calibration_frames], first))
+    order = np.argsort(problem.observations.frame, kind="stable")
+    bounds = np.searchsorted(problem.observations.frame[order], np.arange(len(problem) + 1))
+    for t in range(len(problem)):
+        slam.update(problem.odometry[t], problem.observations.select(order[bounds[t] : bounds[t + 1]]))
+    return slam.finish()
