@@ -13,7 +13,7 @@ import json
 import os
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -34,12 +34,12 @@ from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.supply import Part, SceneSupply, ShapeTable
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import optimisation
-from nolbo_ppl.inference.calibrate import calibrate
+from nolbo_ppl.inference.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.inference.checkpoint import load_tensors, save_tensors
 from nolbo_ppl.inference.elbo import PURE_BOUND
 from nolbo_ppl.inference.monitor import held_out
 from nolbo_ppl.inference.optimisation import OptimisationConfig, StepInfo
-from nolbo_ppl.inference.stages import Stage, StageRun, scene_weights
+from nolbo_ppl.inference.stages import Stage, StageRun, scene_weights, seeded_noise
 from nolbo_ppl.inference.weights import save
 from nolbo_ppl.io import atomic_path, read_jsonl, write_json
 from nolbo_ppl.models.calibration import Calibration
@@ -59,8 +59,8 @@ class TrainConfig:
 
     out: Path = Path("runs/tiny")
     """Folder of the run: configuration, metrics.jsonl, checkpoint, and at the end the model."""
-    preset: Literal["tiny", "paper"] = "tiny"
-    """Networks: `tiny` for CPUs, `paper` for darknet19 and 64^3 voxels."""
+    preset: Literal["nano", "tiny", "paper"] = "tiny"
+    """Networks: `tiny` for CPUs, `paper` for darknet19 and 64^3 voxels, `nano` for demonstrations."""
     objective: Literal["inclusive", "elbo", "paper"] = "inclusive"
     """What is maximised: the inclusive objective, the pure bound, or the paper's (the bound with objectness turned)."""
     orientation: Literal["mixture", "angle", "sincos"] | None = None
@@ -87,9 +87,9 @@ class TrainConfig:
     """Seed of weights, scenes, order, augmentation and noise."""
     shape_steps: int = 1200
     """Steps of the shape autoencoder."""
-    single_steps: int = 200
+    single_steps: int = 100
     """Steps on images of one object."""
-    scene_steps: int = 6000
+    scene_steps: int = 5000
     """Steps on scenes."""
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""
@@ -232,9 +232,11 @@ def run(config: TrainConfig) -> TrainSummary:
         if any(stage.name != "shapes" for stage in stages):
             data.teach(model)
             summary.held_out = held_out(model, data.validation(config.evaluate_scenes))
-            calibration = calibrate(model, data.validation(None))
+            with suppress(TooFewObjects):  # a small folder of a user's own: the scales stay as they were learnt
+                calibration = calibrate(model, data.validation(None))
         summary.seconds = time.perf_counter() - started
         meta = {
+            "calibrated": calibration != Calibration(),
             "training": _plain(dataclasses.asdict(config)),
             "held_out": summary.held_out,
             "versions": {"nolbo_ppl": __version__, "torch": torch.__version__},
@@ -365,12 +367,13 @@ class _Data:
         return prefetch(scenes())
 
     def validation(self, count: int | None) -> Iterator[SceneBatch]:
-        """Held-out batches, without augmentation, with the teacher's latents."""
+        """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
         known = len(self.model.instances)
         supply = SceneSupply(self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, known_instances=known)
         total = len(self._held_out) if count is None else min(count, len(self._held_out))
         for first in range(0, total, 64):
-            yield supply.prepared(torch.arange(first, min(first + 64, total)).numpy())
+            batch = supply.prepared(np.arange(first, min(first + 64, total)))
+            yield batch.replace(noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim))
 
     def teach(self, model: Nolbo) -> None:
         """Encode the shapes by the trained shape guide, in full precision."""
@@ -417,17 +420,16 @@ class _Journal:
             )
         number, at_step = int(meta["stage"]), int(meta["step"])
         self._cut(number, at_step, stages)
-        if at_step == 0:
-            model.load_state_dict(tensors)
-            return number, None, 0
-        return number, tensors, at_step
+        # The networks too: before a stage goes on, the shape guide in them teaches the latents of all shapes.
+        model.load_state_dict(optimisation.module_tensors(tensors) if at_step else tensors)
+        return number, tensors if at_step else None, at_step
 
     def _cut(self, number: int, at_step: int, stages: Sequence[Stage]) -> None:
         """Drop the rows of metrics that were written after the checkpoint: they will be written again."""
         if self.rank or not self.path.is_file():
             return
         order = {stage.name: i for i, stage in enumerate(stages)}
-        rows = [row for _, row in read_jsonl(self.path)]
+        rows = _complete_rows(self.path)
         kept = [row for row in rows if (order.get(row["stage"], 0), row["step"]) <= (number, at_step)]
         with atomic_path(self.path) as temporary:
             temporary.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
@@ -469,7 +471,9 @@ class _Journal:
             self._board.close()
 
 
-_FREE = ("out", "cache", "threads", "workers", "log_every", "checkpoint_every", "evaluate_every", "tensorboard", "resume")
+_FREE = (
+    "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
+)
 """Fields a resumed run may change: they do not touch what is learnt."""
 
 

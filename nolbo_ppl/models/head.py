@@ -74,13 +74,27 @@ class RegionHead(nn.Module):
         if not linear:
             nn.init.constant_(self.objectness.bias, -4.0)
             nn.init.normal_(self.outputs[-1].weight, std=0.02)
-        # The modes of the azimuth start at concentration 1, spread evenly: 0, 90, 180 and 270 degrees for four.
-        angle = torch.arange(modes) * (2 * math.pi / modes)
-        self.register_buffer("natural_start", torch.stack((torch.cos(angle), torch.sin(angle)), -1), persistent=False)
+        self.register_buffer("start", self._start(), persistent=False)
+
+    def _start(self) -> Float[Tensor, "predictors outputs"]:
+        """Where the outputs start.
+
+        Azimuth modes at concentration 1, spread evenly (0, 90, 180 and 270 degrees for four); box sizes of the
+        predictors apart from each other. Predictors that start alike stay alike: which one is responsible is then a toss
+        of a coin that no objectness can foresee.
+        """
+        predictors, modes = self.config.predictors, self.config.azimuth_components
+        start = torch.zeros(predictors, sum(self.sizes))
+        _, _, azimuth, _, box, _ = start.split(self.sizes, -1)
+        turn = torch.arange(modes) * (2 * math.pi / modes)
+        azimuth[:, modes:] = torch.stack((torch.cos(turn), torch.sin(turn)), -1).flatten()
+        if predictors > 1:
+            box[:, 2:4] = torch.linspace(-1, 1, predictors)[:, None]
+        return start
 
     def forward(self, features: Float[Tensor, "*n c"]) -> Float[Tensor, "*n predictors outputs"]:
         """Raw outputs of every predictor of each cell."""
-        return self.outputs(features).unflatten(-1, (self.config.predictors, sum(self.sizes)))
+        return self.outputs(features).unflatten(-1, self.start.shape) + self.start
 
     def parameters_of(
         self, raw: Float[Tensor, "*n outputs"], prior_mean: Float[Tensor, "labels d"]
@@ -93,13 +107,13 @@ class RegionHead(nn.Module):
         label, shape, azimuth, angle, box, range_ = raw.split(self.sizes, -1)
         residual, shape_raw = shape.chunk(2, -1)
         modes = self.config.azimuth_components
-        natural = azimuth[..., modes:].unflatten(-1, (modes, 2)) * 8 + self.natural_start.to(raw.dtype)
+        natural = azimuth[..., modes:].unflatten(-1, (modes, 2))
         angle_loc, angle_raw = angle.chunk(2, -1)
         box_loc, box_raw = box.chunk(2, -1)
         range_loc, range_raw = range_.chunk(2, -1)
         return RegionParameters(
             label_logits=label,
-            shape_loc=torch.softmax(label, -1) @ prior_mean.to(raw.dtype) + 2 * residual,
+            shape_loc=torch.softmax(label, -1) @ prior_mean.to(raw.dtype) + residual,
             shape_scale=bounded_exp(shape_raw, -4.0, 2.0),
             azimuth_logits=azimuth[..., :modes],
             azimuth_natural=natural,
