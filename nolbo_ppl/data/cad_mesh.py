@@ -27,9 +27,9 @@ Faces = Int[np.ndarray, "f 3"]
 
 @dataclass
 class MeshSolid:
-    """A mesh, open or closed, voxelised on demand at twice the resolution (see `mesh_to_voxels`) and kept.
+    """A mesh, open or closed, voxelised on demand at three times the resolution (see `mesh_to_voxels`) and kept.
 
-    Holes up to one voxel wide are closed.
+    Holes up to two thirds of a voxel wide are closed.
     """
 
     vertices: Vertices
@@ -39,7 +39,7 @@ class MeshSolid:
     def fill(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
         """Occupancy of n^3 voxels over [-0.5, 0.5]^3."""
         if n not in self._cache:
-            self._cache[n] = reduce_voxels(mesh_to_voxels(self.vertices, self.faces, 2 * n, gap=1), n)
+            self._cache[n] = reduce_voxels(mesh_to_voxels(self.vertices, self.faces, 3 * n, gap=1), n)
         return self._cache[n].copy()
 
 

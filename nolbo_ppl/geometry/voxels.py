@@ -98,33 +98,54 @@ def voxels_to_mesh(
 def reduce_voxels(
     grid: Bool[np.ndarray, "m m m"],
     n: int,
-    share: float = 0.25,
-    centre: Float[np.ndarray, 3] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    centre: Float[np.ndarray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
 ) -> Bool[np.ndarray, "{n} {n} {n}"]:
-    """Resample a grid to n^3: a voxel is filled when at least `share` of the samples in it are.
+    """Resample a grid to n^3: a voxel is filled when its centre is, or when it holds a part thinner than a voxel.
 
-    At a quarter, rods and plates one fine voxel thick survive halving, and a solid's rounding is unbiased to half a
-    fine voxel. Where n divides m the samples are the fine voxels themselves; n = m changes nothing.
+    The grid is first resampled to k n, the least multiple that is no coarser. What an opening by a cube of 2 (k // 2) + 1
+    removes, and does not touch what is left, is thin; all voxels it touches are filled, so that rods and plates
+    survive while solids keep their size. For even k the eight samples around the centre decide, four suffice.
+    n = m changes nothing.
 
     Args:
         grid: the fine grid, over [-0.5, 0.5]^3 of its own frame.
         n: size of the result.
-        share: share of the samples, in (0, 1].
         centre: where the result's origin lies in the frame of the grid.
         scale: length of the result's unit in the frame of the grid.
     """
     m = grid.shape[0]
-    per_axis = max(2, math.ceil(m / n))
-    ticks = voxel_centres(n * per_axis) * scale
-    count = np.pad(grid, 1).astype(np.uint16)  # what lies outside the grid is empty
+    k = max(1, math.ceil(m / n))
+    radius = k // 2
+    ticks = voxel_centres(n * k) * scale
+    fine = np.pad(grid, 1)  # what lies outside the grid is empty
     for axis in range(3):
         index = np.clip(np.floor((ticks + centre[axis] + 0.5) * m).astype(np.int64), -1, m)
-        fine = np.take(count, index + 1, axis=axis)
-        shape = list(fine.shape)
-        shape[axis : axis + 1] = [n, per_axis]
-        count = fine.reshape(shape).sum(axis=axis + 1)
-    return count >= share * per_axis**3
+        fine = np.take(fine, index + 1, axis=axis)
+    if k == 1:
+        return fine
+    bulk = _spread(~_spread(~np.pad(fine, radius), radius), 2 * radius)
+    thin = fine & ~bulk[radius:-radius, radius:-radius, radius:-radius]
+    filled = thin.reshape(n, k, n, k, n, k).any(axis=5).any(axis=3).any(axis=1)
+    if k % 2:
+        return filled | fine[radius::k, radius::k, radius::k]
+    around = np.zeros((n, n, n), dtype=np.uint8)
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = (slice(radius - 1 + c, None, k) for c in corner)
+        around += fine[x, y, z]
+    return filled | (around >= 4)
+
+
+def _spread(grid: Bool[np.ndarray, "a b c"], radius: int) -> Bool[np.ndarray, "a b c"]:
+    """Dilation by a cube of 2 radius + 1, one axis after the other."""
+    for axis in range(3):
+        source, spread = np.moveaxis(grid, axis, 0), grid.copy()
+        target = np.moveaxis(spread, axis, 0)
+        for shift in range(1, radius + 1):
+            target[shift:] |= source[:-shift]
+            target[:-shift] |= source[shift:]
+        grid = spread
+    return grid
 
 
 def mesh_to_voxels(
@@ -143,7 +164,7 @@ def mesh_to_voxels(
         gap: holes up to 2 `gap` voxels wide are closed. On 77 CAD models (simplified, many open) against solids made
             from the full meshes, 1 raises the mean overlap from 0.71 to 0.78, 2 no further.
     """
-    from scipy.ndimage import binary_dilation, binary_erosion, label  # delayed: heavy to import
+    from scipy.ndimage import label  # delayed: heavy to import
 
     border = 1 + gap  # empty, for the flood to go around the object
     padded = np.zeros((n + 2 * border,) * 3, dtype=bool)
@@ -153,12 +174,8 @@ def mesh_to_voxels(
             if index.min() < 0 or index.max() >= n:
                 index = index[:, ((index >= 0) & (index < n)).all(axis=0)]
             padded[tuple(index + border)] = True
-    ball = np.ones((3, 3, 3), dtype=bool)
-    walls = binary_dilation(padded, ball, iterations=gap) if gap > 0 else padded
-    region, _ = label(~walls)  # the corner of the border is outside
-    solid = region != region[0, 0, 0]
-    if gap > 0:
-        solid = binary_erosion(solid, ball, iterations=gap) | padded
+    region, _ = label(~_spread(padded, gap))  # the corner of the border is outside
+    solid = ~_spread(region == region[0, 0, 0], gap) | padded
     return solid[border:-border, border:-border, border:-border]
 
 

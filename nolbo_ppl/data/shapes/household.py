@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from nolbo_ppl.data.shapes.builder import Builder, Draw
 
 
@@ -9,50 +11,44 @@ def bottle(b: Builder, d: Draw) -> int:
     """Add one bottle (wine, beer, water, spirits, sauce, jug); returns its symmetry: 0, or 4 for a square section."""
     style = d.choice(bordeaux=0.18, burgundy=0.12, beer=0.16, water=0.2, flask=0.12, sauce=0.12, jug=0.1)
     height, radius, shoulder, neck, neck_h = {
-        "bordeaux": (d(0.28, 0.34), d(0.035, 0.042), d(0.08, 0.12), d(0.013, 0.016), d(0.2, 0.28)),
-        "burgundy": (d(0.28, 0.32), d(0.04, 0.05), d(0.28, 0.36), d(0.013, 0.016), d(0.12, 0.2)),
-        "beer": (d(0.2, 0.28), d(0.028, 0.037), d(0.14, 0.24), d(0.011, 0.015), d(0.14, 0.24)),
-        "water": (d(0.2, 0.36), d(0.03, 0.05), d(0.1, 0.22), d(0.012, 0.018), d(0.03, 0.06)),
-        "flask": (d(0.18, 0.3), d(0.035, 0.055), d(0.04, 0.1), d(0.014, 0.02), d(0.08, 0.2)),
-        "sauce": (d(0.16, 0.26), d(0.022, 0.034), d(0.1, 0.2), d(0.01, 0.014), d(0.06, 0.14)),
-        "jug": (d(0.2, 0.32), d(0.055, 0.085), d(0.12, 0.26), d(0.018, 0.03), d(0.04, 0.1)),
+        "bordeaux": (d(0.26, 0.36), d(0.03, 0.048), d(0.06, 0.16), d(0.012, 0.018), d(0.16, 0.32)),
+        "burgundy": (d(0.26, 0.34), d(0.036, 0.056), d(0.24, 0.4), d(0.012, 0.018), d(0.1, 0.22)),
+        "beer": (d(0.17, 0.3), d(0.026, 0.042), d(0.1, 0.28), d(0.01, 0.016), d(0.1, 0.28)),
+        "water": (d(0.18, 0.38), d(0.026, 0.058), d(0.08, 0.26), d(0.011, 0.02), d(0.03, 0.1)),
+        "flask": (d(0.14, 0.32), d(0.032, 0.065), d(0.02, 0.12), d(0.012, 0.022), d(0.05, 0.24)),
+        "sauce": (d(0.14, 0.28), d(0.02, 0.04), d(0.08, 0.26), d(0.009, 0.015), d(0.05, 0.22)),
+        "jug": (d(0.18, 0.34), d(0.05, 0.1), d(0.1, 0.32), d(0.016, 0.034), d(0.03, 0.14)),
     }[style]
-    cap = d(0.03, 0.09) * height
+    cap = d(0.03, 0.1) * height
     body = height - cap
     z_neck = body - neck_h * height
     z_shoulder = z_neck - shoulder * height
     square = style == "flask" and d.chance(0.6)
+    # One exponent serves the whole loft: the neck of a square bottle is square too.
     exponent = d(5, 9) if square else 2.0
-    waist = d(0.82, 0.96) if style in ("water", "sauce") and d.chance(0.6) else 1.0
-    segments = 16
+    waist = d(0.76, 0.97) if d.chance(0.5) else 1.0
+    foot = d(0.72, 0.98) if d.chance(0.35) else 1.0
+    curve = d(0.6, 0.95)
     fill = d(0.55, 1.0) * z_shoulder
     wall = "bottle" if style != "jug" or d.chance(0.5) else "plastic"
     below = "liquid" if wall == "bottle" and d.chance(0.5) else wall
-    stations = (
-        0.0,
-        0.02 * height,
-        0.5 * z_shoulder,
-        fill,
-        z_shoulder,
-        z_shoulder + 0.45 * (z_neck - z_shoulder),
-        z_neck,
-        body,
-    )
-    fill_r = 1.0 + (waist - 1.0) * (z_shoulder - fill) / (0.5 * z_shoulder)
-    radii = (0.9 * radius, radius, waist * radius, fill_r * radius, radius, radius * d(0.8, 0.93), neck * 1.1, neck)
-    if exponent > 2:
-        # The neck of a square bottle stays square in section here: one exponent serves the whole loft.
-        radii = radii[:-2] + (neck, neck)
+    fill_share = 1.0 + (waist - 1.0) * (z_shoulder - fill) / (0.5 * z_shoulder)
+    z_curve = z_shoulder + 0.45 * (z_neck - z_shoulder)
+    stations = (0.0, 0.02 * height, 0.5 * z_shoulder, fill, z_shoulder, z_curve, z_neck, body)
+    shares = (0.9 * foot, foot, waist, fill_share, 1.0)
+    on_curve = neck + curve * (radius - neck)
+    radii = (*(share * radius for share in shares), on_curve, neck if square else 1.1 * neck, neck)
     roles = (below,) * 3 + (wall,) * 4
-    b.loft(2, roles, stations, (0, 0), radii, exponent=exponent, segments=segments, caps=(wall, wall))
-    b.cylinder(2, "cap", (0, 0, body + 0.5 * cap - 0.003), neck * d(1.15, 1.5), 0.5 * cap + 0.003, segments=segments)
+    b.loft(2, roles, stations, (0, 0), radii, exponent=exponent, segments=16, caps=(wall, wall))
+    b.cylinder(2, "cap", (0, 0, body + 0.5 * cap - 0.003), neck * d(1.15, 1.5), 0.5 * cap + 0.003, segments=16)
     if style in ("bordeaux", "burgundy", "beer"):
         low = body - d(0.4, 0.9) * neck_h * height
-        b.cylinder(2, "cap", (0, 0, 0.5 * (low + body)), neck * 1.1 + 0.002, 0.5 * (body - low), segments=segments)
+        b.cylinder(2, "cap", (0, 0, 0.5 * (low + body)), neck * 1.1 + 0.002, 0.5 * (body - low), segments=16)
     if d.chance(0.8):
         low, high = d(0.12, 0.3) * z_shoulder, d(0.6, 0.95) * z_shoulder
-        proud = radius + 0.006 * height
-        b.loft(2, "label", (low, high), (0, 0), (proud, proud), exponent=exponent, segments=segments)
+        ends = (low, min(max(0.5 * z_shoulder, low + 1e-3), high - 1e-3), high)
+        proud = [float(np.interp(z, stations, radii)) + 0.006 * height for z in ends]
+        b.loft(2, "label", ends, (0, 0), proud, exponent=exponent, segments=16)
     return 4 if square else 0
 
 

@@ -45,7 +45,7 @@ def triangulate(polygon: Points) -> list[tuple[int, int, int]]:
     """Triangles (corner indices, counter-clockwise) of a simple counter-clockwise polygon, by ear clipping.
 
     Raises:
-        InputError: the polygon crosses itself.
+        InputError: no corner can be cut off: the polygon is clockwise or crosses itself.
     """
     n = len(polygon)
     if is_convex(polygon):
@@ -71,7 +71,9 @@ def triangulate(polygon: Points) -> list[tuple[int, int, int]]:
             # Corners in a straight line leave no ear: drop one of them, it bounds no area.
             flat = [k for k in range(len(left)) if abs(turn(left[k - 1], left[k], left[(k + 1) % len(left)])) <= 1e-14]
             if not flat:
-                raise input_error("polygon crosses itself", got=polygon.tolist(), expected="a simple polygon")
+                raise input_error(
+                    "polygon that cannot be triangulated", got=polygon.tolist(), expected="simple, counter-clockwise"
+                )
             del left[flat[0]]
     triangles.append((left[0], left[1], left[2]))
     return triangles

@@ -22,6 +22,10 @@ Axis = Float[np.ndarray, " n"]
 Mesh = tuple[np.ndarray, np.ndarray, list[str]]
 """Vertices float64 [v, 3], faces int [f, 3] counter-clockwise seen from outside, and a role per face."""
 
+ROUND = 1.25
+"""Round rods are tested this much thicker than plates: 0.75 voxel to each side exceeds sqrt(2) / 2, the greatest
+distance of a line from the nearest row of voxel centres, so that none breaks."""
+
 PLANE_AXES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}
 """The two axes (v, w) of the plane across axis u. (u, v, w) is right-handed except for u = 1."""
 
@@ -218,7 +222,8 @@ class Loft:
         extra = max(thin - 0.5 * float(self.stations[-1] - self.stations[0]), 0.0)
         within = (u >= self.stations[0] - extra) & (u <= self.stations[-1] + extra)
         c0, c1 = (np.interp(u, self.stations, self.centre[:, i]) for i in (0, 1))
-        h0, h1 = (np.maximum(np.interp(u, self.stations, self.half[:, i]), thin) for i in (0, 1))
+        least = thin if self.section is not None else ROUND * thin
+        h0, h1 = (np.maximum(np.interp(u, self.stations, self.half[:, i]), least) for i in (0, 1))
         a, b = (v - c0[:, None]) / h0[:, None], (w - c1[:, None]) / h1[:, None]  # [u, v], [u, w]
         if self.section is None:
             a, b = np.abs(a) ** self.exponent, np.abs(b) ** self.exponent

@@ -151,7 +151,7 @@ def _arms(b: Builder, d: Draw, half: float, front: float, rear: float, seat: flo
     t = d(0.018, 0.03)
     fore = front + d(0.02, 0.12)
     b.pair(frame, (half, half + 2 * t), (fore, rear + 0.03), (z - 0.025, z))
-    b.pair(frame, (half + 0.2 * t, half + 1.8 * t), (fore + 0.01, fore + 0.05), (seat - 0.06, z - 0.01))
+    b.pair(frame, (half - 0.2 * t, half + 1.8 * t), (fore + 0.01, fore + 0.05), (seat - 0.06, z - 0.01))
 
 
 def sofa(b: Builder, d: Draw) -> int:

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nolbo_ppl.data.shapes.primitives import Primitive
+from nolbo_ppl.data.shapes.primitives import ROUND, Primitive
 from nolbo_ppl.errors import input_error
 
 MATERIAL_ROLES: tuple[str, ...] = (
@@ -78,19 +78,19 @@ class AnalyticSolid:
     def fill(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
         """Fill every primitive in its own part of the grid (see `Solid.fill`).
 
-        Walls, tubes and panels thinner than 0.6 voxel to each side (`LEAST_HALF_VOXELS`) are thickened to that.
+        Walls and panels thinner than 0.6 voxel to each side (`LEAST_HALF_VOXELS`) are thickened to that, round rods to
+        0.75.
         """
         step = self.diagonal / n
         thin = LEAST_HALF_VOXELS * step
+        pad = ROUND * thin
         ticks = (np.arange(n) + 0.5) * step - 0.5 * self.diagonal
         axes = [ticks + c for c in self.centre]
         first = [float(axis[0]) for axis in axes]
         grid = np.zeros((n, n, n), dtype=bool)
         for primitive, (low, high) in zip(self.primitives, self._bounds):
             window = tuple(
-                slice(
-                    max(int((low[i] - thin - first[i]) / step), 0), max(int((high[i] + thin - first[i]) / step) + 1, 0)
-                )
+                slice(max(int((low[i] - pad - first[i]) / step), 0), max(int((high[i] + pad - first[i]) / step) + 1, 0))
                 for i in range(3)
             )
             grid[window] |= primitive.inside(axes[0][window[0]], axes[1][window[1]], axes[2][window[2]], thin)
@@ -126,7 +126,8 @@ class Shape:
     def voxels(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
         """Solid occupancy at the centres of n^3 voxels over [-0.5, 0.5]^3, index [ix, iy, iz].
 
-        Parts thinner than 0.6 voxel to each side are thickened to that, so that spokes and chair legs survive.
+        Parts thinner than 0.6 voxel to each side (0.75 for round ones) are thickened to that, so that bicycle tubes and
+        chair legs survive.
         Raises `InputError` unless n is at least 1.
         """
         if n < 1:

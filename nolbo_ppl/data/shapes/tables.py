@@ -8,7 +8,7 @@ from nolbo_ppl.data.shapes.builder import Builder, Draw
 def diningtable(b: Builder, d: Draw) -> int:
     """Add one table; returns its symmetry: 0 round on a round foot, 4 square or round on four legs, else 2."""
     top = d.choice(rectangle=0.44, square=0.16, round=0.28, oval=0.12)
-    height, thick = d(0.68, 0.8), d(0.02, 0.06)
+    height, thick = d(0.62, 0.95), d(0.02, 0.09)
     role = d.choice(wood=0.75, glass=0.12, plastic=0.13)
     frame = d.choice(wood=0.6, metal=0.2, dark_metal=0.2) if role != "glass" else "metal"
     long = d(0.6, 1.2) if top == "rectangle" else d(0.5, 0.9) if top == "oval" else d(0.38, 0.75)
@@ -27,14 +27,20 @@ def diningtable(b: Builder, d: Draw) -> int:
     inset = d(0.03, 0.3 if order == 4 else 0.22)
     x, y = (long, deep) if top in ("rectangle", "square") else (long * 0.68, deep * 0.68)
     inset_y = inset if order == 4 else d(0.02, 0.1)
-    kind = d.choice(legs=0.62, taper=0.2, trestle=0.18 if order == 2 else 0.0)
-    t = d(0.02, 0.05)
+    kind = d.choice(legs=0.45, taper=0.22, column=0.18, trestle=0.15 if order == 2 else 0.0)
+    t = d(0.02, 0.06)
     px, py = x - inset * x - t, y - inset_y * y - t
     if kind == "trestle":
         b.pair(frame, (px - t, px + t), (-0.25 * y - t, 0.25 * y + t), (0.03, z0))
         b.pair(frame, (px - 1.6 * t, px + 1.6 * t), (-py, py), (0, 0.07))
         b.box(frame, (-px, px), (-t, t), (0.25 * height, 0.25 * height + 0.1))
         return order
+    if kind == "column":
+        stem, foot = d(0.1, 0.3), d(0.35, 0.8)
+        b.box(frame, (-stem * px, stem * px), (-stem * py, stem * py), (0.02, z0))
+        b.box(frame, (-foot * px, foot * px), (-foot * py, foot * py), (0, d(0.03, 0.1)))
+        return order
+    splay = d(-0.04, 0.1)
     for sx in (-1.0, 1.0):
         for sy in (-1.0, 1.0):
             if kind == "legs":
@@ -44,15 +50,18 @@ def diningtable(b: Builder, d: Draw) -> int:
                     2,
                     frame,
                     (0, z0),
-                    [(sx * (px + 0.5 * t), sy * (py + 0.5 * t)), (sx * px, sy * py)],
+                    [(sx * (px + splay), sy * (py + splay)), (sx * px, sy * py)],
                     [0.5 * t, 1.2 * t],
                     section=((-1, -1), (1, -1), (1, 1), (-1, 1)),
                 )
     if d.chance(0.6):
-        h = d(0.05, 0.12)
+        h = d(0.05, 0.2)
         b.pair(frame, (px - 0.4 * t, px + 0.4 * t), (-py, py), (z0 - h, z0))
         for sy in (-1.0, 1.0):
             b.box(frame, (-px, px), (sy * py - 0.4 * t, sy * py + 0.4 * t), (z0 - h, z0))
+    if d.chance(0.25):
+        z = d(0.1, 0.45) * height
+        b.box(role, (-px, px), (-py, py), (z, z + 0.025))
     return order
 
 

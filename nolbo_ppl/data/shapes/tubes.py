@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from nolbo_ppl.data.shapes.primitives import PLANE_AXES, Axis, Mesh, from_plane, rings_to_faces, to_world
+from nolbo_ppl.data.shapes.primitives import PLANE_AXES, ROUND, Axis, Mesh, from_plane, rings_to_faces, to_world
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class Tube:
         return np.concatenate(rings), faces, [self.role] * len(faces)
 
     def inside(self, x: Axis, y: Axis, z: Axis, thin: float) -> Bool[np.ndarray, "i j k"]:
-        """Distance to each straight piece; joints are round, ends flat."""
+        """Distance to each straight piece; joints are round, ends flat, or round where the tube had to be thickened."""
+        thin = ROUND * thin
         result = np.zeros((len(x), len(y), len(z)), dtype=bool)
         last = len(self.path) - 2
         for i in range(last + 1):
@@ -73,11 +74,10 @@ class Tube:
             # |d - near e|^2 = |d|^2 - (2 along - near) near |e|^2
             distance = ((dx * dx)[:, None] + dy * dy)[:, :, None] + dz * dz - (2 * along - near) * near * square
             hit = distance <= (r0 + near * (r1 - r0)) ** 2
-            overhang = max(thin / math.sqrt(square) - 0.5, 0.0) if last == 0 else 0.0
-            if i == 0:
-                hit &= along >= -overhang
-            if i == last:
-                hit &= along <= 1.0 + overhang
+            if i == 0 and self.radius[0] >= thin:
+                hit &= along >= 0.0
+            if i == last and self.radius[-1] >= thin:
+                hit &= along <= 1.0
             result[window] |= hit
         return result
 
@@ -124,5 +124,5 @@ class Torus:
         u = grid[self.axis]
         v, w = (grid[i] for i in PLANE_AXES[self.axis])
         plane = (np.sqrt(v[:, None] ** 2 + w[None, :] ** 2) - self.ring) ** 2
-        tube = max(self.tube, thin)
+        tube = max(self.tube, ROUND * thin)
         return from_plane(self.axis, plane <= (tube * tube - u * u)[:, None, None])
