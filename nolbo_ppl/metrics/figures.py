@@ -201,7 +201,9 @@ def _objectness_error(found: Matches, weights: Float[np.ndarray, "b scenes"]) ->
     """Calibration error of objectness over the detections, right where they match a truth."""
     kept = judged(found)
     score, correct, scene = found.score[kept], found.correct[kept], found.scene[kept]
-    return estimate(lambda w: expected_calibration_error(score, correct, w[:, scene]), weights, len(score))
+    return estimate(
+        lambda w: expected_calibration_error(score, correct, w[:, scene]), weights, len(score), pivotal=True
+    )
 
 
 def judged(found: Matches) -> Bool[np.ndarray, " n"]:
@@ -214,7 +216,9 @@ def _class_error(objects: ObjectRecords, weights: Float[np.ndarray, "b scenes"])
     rows = objects.category >= 0
     confidence, right = top_label(objects.class_posterior[rows], objects.category[rows])
     scene = objects.scene[rows]
-    return estimate(lambda w: expected_calibration_error(confidence, right, w[:, scene]), weights, len(scene))
+    return estimate(
+        lambda w: expected_calibration_error(confidence, right, w[:, scene]), weights, len(scene), pivotal=True
+    )
 
 
 def category_table(

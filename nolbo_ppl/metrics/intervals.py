@@ -40,12 +40,21 @@ def resample_weights(scenes: int, resamples: int, rng: np.random.Generator) -> F
 
 
 def estimate(
-    statistic: Statistic, weights: Float[np.ndarray, "resamples scenes"], count: int, level: float = 0.95
+    statistic: Statistic, weights: Float[np.ndarray, "resamples scenes"], count: int, level: float = 0.95,
+    pivotal: bool = False,
 ) -> Estimate:
-    """The statistic of the scenes with its percentile bootstrap interval (Efron & Tibshirani 1993, section 13.3).
+    """The statistic of the scenes with its bootstrap interval (Efron & Tibshirani 1993, sections 13.3 and 12.5).
 
     Scenes are resampled, not objects: objects of one image share its light, camera and occlusion. Resamples in which
     the statistic is undefined (a category is missing) are left out.
+
+    Args:
+        statistic: the statistic.
+        weights: how often each scene is in each resample.
+        count: objects behind the figure.
+        level: probability of the interval.
+        pivotal: reflect the resampled quantiles about the value, not below zero: for a non-negative statistic that
+            resampling biases upwards (a mean of absolute values), whose quantiles would lie above the value itself.
 
     Raises:
         InputError: `level` is not in (0, 1).
@@ -60,6 +69,8 @@ def estimate(
     if not len(resampled):
         return Estimate(value, None, None, count)
     low, high = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
+    if pivotal:
+        low, high = max(2 * value - high, 0.0), max(2 * value - low, 0.0)
     return Estimate(value, float(low), float(high), count)
 
 

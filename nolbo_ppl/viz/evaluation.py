@@ -13,6 +13,7 @@ from jaxtyping import Float
 from nolbo_ppl.metrics.calibration import Reliability, reliability, top_label
 from nolbo_ppl.metrics.detection import Matches, average_precision, precision_recall
 from nolbo_ppl.metrics.figures import DetectionRecords, ObjectRecords, confusion, judged
+from nolbo_ppl.metrics.intervals import wilson_interval
 from nolbo_ppl.metrics.viewpoint import ACCURATE
 from nolbo_ppl.viz.style import INK, MUTED, category_colour, grid, new_figure, save, styled
 
@@ -68,8 +69,14 @@ def _curve(axes: Axes, matches: Matches, name: str, colour: str, width: float) -
     if not matches.truths.sum():
         return
     pr = precision_recall(matches)
+    if not len(pr.recall):
+        return
+    # The envelope: the largest precision at that or any higher recall, whose area is the average precision.
+    envelope = np.maximum.accumulate(pr.precision[::-1])[::-1]
     label = f"{name}  {average_precision(matches)[0]:.3f}"
-    axes.plot(pr.recall, pr.precision, color=colour, linewidth=width, label=label)
+    recall = np.concatenate(([0.0], pr.recall, pr.recall[-1:]))
+    height = np.concatenate((envelope[:1], envelope, [0.0]))
+    axes.step(recall, height, where="pre", color=colour, linewidth=width, label=label)
 
 
 def draw_reliability(objects: ObjectRecords, detections: DetectionRecords) -> Figure:
@@ -88,16 +95,17 @@ def draw_reliability(objects: ObjectRecords, detections: DetectionRecords) -> Fi
 
 
 def _diagram(axes: Axes, diagram: Reliability, title: str) -> None:
-    """Bars of frequency by stated probability; the width of the lower bars shows how many there are."""
+    """Frequency by stated probability with Wilson intervals; bars show the share of cases in each bin."""
     used = diagram.count > 0
     width = diagram.edges[1] - diagram.edges[0]
     middle = (diagram.edges[:-1] + diagram.edges[1:])[used] / 2
     axes.plot([0, 1], [0, 1], color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
     share = diagram.count[used] / max(diagram.count.sum(), 1)
     axes.bar(middle, share, width * 0.92, color="#dbe3ec", zorder=0.5, label="share of all")
-    standard_error = np.sqrt(diagram.frequency * (1 - diagram.frequency) / np.maximum(diagram.count, 1))[used]
+    frequency, count = diagram.frequency[used], diagram.count[used]
+    limits = np.array([wilson_interval(float(f * n), int(n)) for f, n in zip(frequency, count)]).reshape(-1, 2)
     axes.errorbar(
-        diagram.confidence[used], diagram.frequency[used], 1.96 * standard_error, fmt="o", color="#2f6fde",
+        diagram.confidence[used], frequency, np.abs(limits.T - frequency), fmt="o", color="#2f6fde",
         markersize=4.5, elinewidth=1.0, capsize=2, zorder=3, label="frequency, 95 %",
     )  # fmt: skip
     error = np.nansum(np.abs(diagram.frequency - diagram.confidence) * diagram.count) / max(diagram.count.sum(), 1)
@@ -141,7 +149,7 @@ def draw_confusion(objects: ObjectRecords, categories: Sequence[str]) -> Figure:
         accuracy = np.trace(counts) / max(counts.sum(), 1)
         axes.set(xlabel="maximum likelihood", ylabel="true", title=f"category at the true boxes: {accuracy:.3f} right")
         axes.tick_params(length=0)
-        figure.subplots_adjust(left=0.19, right=0.98, bottom=0.2, top=0.93)
+        figure.subplots_adjust(left=0.16, right=0.98, bottom=0.17, top=0.94)
     return figure
 
 

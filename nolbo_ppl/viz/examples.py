@@ -113,8 +113,8 @@ def _draw_example(
     axes.imshow(truth.image, extent=(0, width, height, 0), interpolation="lanczos")
     axes.set(xlim=(centre[0] - wide, centre[0] + wide), ylim=(centre[1] + half, centre[1] - half), aspect="equal")
     if np.isfinite(truth.position[slot]).all() and np.isfinite(truth.R_camera_object[slot]).all():
-        length = 0.5 * float(answer.diagonal[0])
-        # At the true place and at one size, so that only the directions differ.
+        # At the true place and at a size that fills the box, so that only the directions differ.
+        length = 0.9 * half * float(truth.position[slot, 2] / truth.intrinsics[:2].mean())
         draw_frame(axes, answer.R_camera_object[0], truth.position[slot], length, truth.intrinsics)
         draw_frame(
             axes, truth.R_camera_object[slot], truth.position[slot], length, truth.intrinsics, colours=TRUE_AXES,
