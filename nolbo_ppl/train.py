@@ -471,6 +471,15 @@ class _Journal:
             self._board.close()
 
 
+def _complete_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of metrics; the last line may have been cut when the process was killed."""
+    *whole, last = path.read_text(encoding="utf-8").split("\n")
+    if last:
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(line + "\n" for line in whole), encoding="utf-8")
+    return [row for _, row in read_jsonl(path)]
+
+
 _FREE = (
     "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
 )

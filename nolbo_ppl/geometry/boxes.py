@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -41,8 +42,11 @@ def nms(
     iou = pairwise_iou(boxes[order], boxes[order])
     if group is not None:
         iou = torch.where(group[order][:, None] == group[order], iou, -1.0)
+    overlaps = ~(iou <= iou_threshold).numpy()
+    removed = np.zeros(len(order), dtype=np.bool_)
     kept: list[int] = []
     for i in range(len(order)):
-        if not kept or bool((iou[i, kept] <= iou_threshold).all()):
+        if not removed[i]:
             kept.append(i)
+            removed |= overlaps[i]
     return order[torch.tensor(kept, dtype=torch.long)]

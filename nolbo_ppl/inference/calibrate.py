@@ -10,11 +10,19 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from torch import Tensor
 
-from nolbo_ppl.errors import input_error
+from nolbo_ppl.errors import InputError
 from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.nolbo import Nolbo
 from nolbo_ppl.models.scene import SceneBatch
+
+
+LEAST_OBJECTS = 50
+"""Fewer held-out objects than this fix no factor."""
+
+
+class TooFewObjects(InputError):
+    """Not enough held-out objects to fit the factors on."""
 
 
 def region_factor(squared: Float[Tensor, " n"], dimensions: int, level: float = 0.9) -> float:
@@ -78,12 +86,13 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
     Gaussian heads by their 90 % regions.
 
     Raises:
-        InputError: the scenes hold fewer than 50 objects.
+        TooFewObjects: the scenes hold fewer than `LEAST_OBJECTS` objects.
     """
     model.eval()
     found = _collect(model, batches)
-    if len(found.get("box", ())) < 50:
-        raise input_error("too few objects to calibrate on", got=len(found.get("box", ())), expected="at least 50")
+    count = len(found.get("box", ()))
+    if count < LEAST_OBJECTS:
+        raise TooFewObjects(f"too few objects to calibrate on: got {count}, expected at least {LEAST_OBJECTS}")
 
     def objectness(x: Tensor) -> Tensor:
         odds = x[0].exp() * found["logit"] + x[1]

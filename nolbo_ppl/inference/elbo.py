@@ -64,6 +64,7 @@ INCLUSIVE: dict[str, float] = {
     "objectness_inclusive": 1.0,
     "label_inclusive": 1.0,
     "shape_inclusive": 0.25,
+    "instance_inclusive": 0.25,
     "orientation_inclusive": 2.0,
     "box_inclusive": 0.5,
     "range_inclusive": 0.5,

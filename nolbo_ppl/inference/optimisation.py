@@ -144,14 +144,19 @@ def state_tensors(state: OptimisationState) -> dict[str, Tensor]:
     }
 
 
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def module_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The module's own state dictionary among the tensors of `state_tensors`."""
+    return _part(tensors, "model/")
+
+
 def restore(state: OptimisationState, tensors: dict[str, Tensor], at_step: int) -> OptimisationState:
     """Put a state back to what `state_tensors` saved, bit for bit."""
-
-    def part(prefix: str) -> dict[str, Tensor]:
-        return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-    state.module.load_state_dict(part("model/"))
-    state.average = {name: value.clone() for name, value in part("average/").items()}
-    restore_optimizer(state.optimizer, part("optimizer/"), dict(state.module.named_parameters()))
+    state.module.load_state_dict(module_tensors(tensors))
+    state.average = {name: value.clone() for name, value in _part(tensors, "average/").items()}
+    restore_optimizer(state.optimizer, _part(tensors, "optimizer/"), dict(state.module.named_parameters()))
     state.step = at_step
     return state

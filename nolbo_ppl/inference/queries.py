@@ -251,8 +251,11 @@ class ObservationModel:
         box_scale = q.box_scale * q.box_scale.new_tensor(config.box_spread)
         box_scale[:, :2] *= config.stride
         position, diagonal = decode_range(q.range_loc, box, camera, config)
-        azimuth = VonMisesMixture(q.azimuth_logits, q.azimuth_natural, max_concentration=config.max_concentration)
-        viewpoint = torch.cat((azimuth.mode[:, None], q.angle_loc), -1)
+        azimuth = VonMisesMixture(
+            q.azimuth_logits, q.azimuth_natural, max_concentration=config.max_concentration, validate_args=False
+        )  # fmt: skip
+        # Sharp modes sit at a component's mean, a candidate of its own: a coarse grid finds the broad ones.
+        viewpoint = torch.cat((azimuth.find_mode(grid=90)[:, None], q.angle_loc), -1)
         R = allocentric_to_egocentric(viewpoint_to_matrix(viewpoint), position)
         best = (azimuth.component_mean - viewpoint[:, :1]).cos().argmax(-1, keepdim=True)
         azimuth_variance = 1 / torch.gather(azimuth.concentration, -1, best)[:, 0].clamp_min(0.1)
