@@ -22,6 +22,8 @@ CLIP = 3.0
 """Whitened residuals are clipped here before they are correlated."""
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
+UNSTATED_FACTOR = 4.0
+"""Least factor where nobody stated a scale: detectors are biased by view, which residuals about one track do not show."""
 LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
@@ -71,7 +73,8 @@ def calibrate(state: SlamState) -> SlamState:
     factor = np.where(stated, _stated_factor(ratio, "position", stated[rows], config.correct_scales, warnings),
                       np.nan_to_num(max(ratio, 1.0), nan=1.0))
     report["position_track_width"] = ratio
-    report["position_correlation_factor"] = position_factor = correlation_factor(z, state.landmark, frame)
+    least = 1.0 if stated[rows].any() else UNSTATED_FACTOR
+    report["position_correlation_factor"] = position_factor = max(correlation_factor(z, state.landmark, frame), least)
     noise = replace(noise, position_covariance=noise.position_covariance * (factor**2)[:, None, None],
                     position_factor=position_factor)
     oriented = np.flatnonzero(table.has_rotation[rows])
@@ -89,7 +92,8 @@ def calibrate(state: SlamState) -> SlamState:
             factor = np.where(stated, _stated_factor(ratio, "rotation", stated[k], config.correct_scales, warnings),
                               np.nan_to_num(max(ratio, 1.0), nan=1.0))
             report["rotation_track_width"] = ratio
-            report["rotation_correlation_factor"] = rotation_factor = correlation_factor(w, j, table.frame[k])
+            least = 1.0 if stated[k].any() else UNSTATED_FACTOR
+            report["rotation_correlation_factor"] = rotation_factor = max(correlation_factor(w, j, table.frame[k]), least)
             noise = replace(noise, rotation_scale=noise.rotation_scale * factor, rotation_factor=rotation_factor)
     clean = {name: value for name, value in report.items() if np.isfinite(value)}
     return replace(state, noise=replace(noise, report=clean, warnings=tuple(dict.fromkeys(warnings))))
