@@ -10,6 +10,7 @@ from nolbo_ppl import __version__
 from nolbo_ppl.errors import NolboError
 
 VERBS = {
+    "demo": "a short training run, then posteriors of unseen scenes",
     "scenes": "write a data set of generated scenes",
     "train": "train an observation model",
     "evaluate": "measure a model on unseen scenes",
