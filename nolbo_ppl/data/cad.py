@@ -164,13 +164,30 @@ def _load_archive(folder: Path, wanted: set[str] | None, diagonals: Mapping[str,
     meta = read_json(folder / "meta.json")
     mesh_file, voxel_file = folder / "meshes.npz", folder / "voxels64.npz"
     try:
-        with np.load(mesh_file, allow_pickle=False) as meshes, np.load(voxel_file, allow_pickle=False) as grids:
+        # Opened here, since numpy leaves a file that is no archive open.
+        with (
+            mesh_file.open("rb") as mesh_bytes,
+            voxel_file.open("rb") as voxel_bytes,
+            np.load(mesh_bytes, allow_pickle=False) as meshes,
+            np.load(voxel_bytes, allow_pickle=False) as grids,
+        ):
             row = {str(name): i for i, name in enumerate(grids["names"])}
             solids = grids["solid"]
             for name, info in meta.items():
                 if wanted is None or info["category"] in wanted:
                     yield _archive_shape(name, info, meshes, solids[row[name]], diagonals, mesh_file)
-    except (KeyError, zipfile.BadZipFile, OSError, TypeError, AttributeError) as error:
+    except NolboError:
+        raise
+    except (
+        KeyError,
+        IndexError,
+        zipfile.BadZipFile,
+        OSError,
+        EOFError,
+        TypeError,
+        AttributeError,
+        ValueError,
+    ) as error:
         raise input_error(
             "malformed CAD archive",
             got=f"{type(error).__name__}: {error}",

@@ -98,15 +98,15 @@ def voxels_to_mesh(
 def reduce_voxels(
     grid: Bool[np.ndarray, "m m m"],
     n: int,
-    centre: Float[np.ndarray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    centre: Float[np.ndarray, " 3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
 ) -> Bool[np.ndarray, "{n} {n} {n}"]:
     """Resample a grid to n^3: a voxel is filled when its centre is, or when it holds a part thinner than a voxel.
 
-    The grid is first resampled to k n, the least multiple that is no coarser. What an opening by a cube of 2 (k // 2) + 1
-    removes, and does not touch what is left, is thin; all voxels it touches are filled, so that rods and plates
-    survive while solids keep their size. For even k the eight samples around the centre decide, four suffice.
-    n = m changes nothing.
+    The grid is first resampled to k n, the least multiple that is no coarser. What an opening by a cube of
+    2 (k // 2) + 1 removes, and does not touch what is left, is thin; all voxels it touches are filled, so that rods
+    and plates survive while solids keep their size. For even k the eight samples around the centre decide, four
+    suffice. n = m changes nothing.
 
     Args:
         grid: the fine grid, over [-0.5, 0.5]^3 of its own frame.

@@ -68,7 +68,7 @@ class AnalyticSolid:
     """
 
     primitives: tuple[Primitive, ...]
-    centre: Float[np.ndarray, 3]
+    centre: Float[np.ndarray, " 3"]
     diagonal: float
 
     @cached_property
@@ -135,7 +135,7 @@ class Shape:
         return self.solid.fill(n)
 
     @property
-    def dimensions(self) -> Float[np.ndarray, 3]:
+    def dimensions(self) -> Float[np.ndarray, " 3"]:
         """Side lengths of the box along x, y and z in metres."""
         return (self.vertices.max(axis=0) - self.vertices.min(axis=0)) * self.diagonal
 
