@@ -160,9 +160,7 @@ def observed_scene(
     is_object = torch.zeros(scenes, regions, dtype=torch.bool)
     for b, m in batch.present.nonzero().tolist():
         is_object[b, cell[b, m] * config.predictors] = True
-    has_range = batch.has_position & batch.has_size
-    safe = torch.where(has_range[..., None], batch.position, torch.tensor([0.0, 0.0, 1.0]).to(batch.position))
-    diagonal = torch.where(has_range, batch.diagonal, 1.0)
+    batch = batch.neutral()
     camera = batch.intrinsics[:, None].expand(-1, slots, -1)
     assignment = Assignment(
         cell=cell,
@@ -170,8 +168,8 @@ def observed_scene(
         assigned=batch.present,
         is_object=is_object,
         box_target=encode_box(batch.box, cell, columns, config),
-        range_target=encode_range(safe, diagonal, batch.box, camera, config),
-        has_range=has_range,
+        range_target=encode_range(batch.position, batch.diagonal, batch.box, camera, config),
+        has_range=batch.has_position & batch.has_size,
     )
     g = torch.Generator().manual_seed(seed + 100)
     logit = 2 * torch.randn(scenes, regions, generator=g, dtype=torch.float64) - 1

@@ -112,6 +112,7 @@ class Guide(nn.Module):
     def observe(self, batch: SceneBatch) -> ObservedScene:
         """Encode a batch and find the responsible region of each object."""
         encoding = self.encode(batch.image)
+        batch = batch.neutral()
         stride, columns = self.config.stride, encoding.columns
         cell = cell_of(batch.box, encoding.rows, columns, stride)
         raw = self._raw(encoding, cell)
@@ -127,7 +128,6 @@ class Guide(nn.Module):
             is_object = torch.zeros(len(cell), regions + 1, dtype=torch.bool)  # the last column takes the rest
             is_object.scatter_(1, torch.where(assigned, region, regions), True)
             has_range = batch.has_position & batch.has_size
-            safe_position = torch.where(has_range[..., None], batch.position, batch.position.new_tensor([0.0, 0.0, 1.0]))
             assignment = Assignment(
                 cell=cell,
                 predictor=predictor,
@@ -135,8 +135,8 @@ class Guide(nn.Module):
                 is_object=is_object[:, :regions],
                 box_target=encode_box(batch.box, cell, columns, self.config),
                 range_target=encode_range(
-                    safe_position,
-                    torch.where(has_range, batch.diagonal, torch.ones_like(batch.diagonal)),
+                    batch.position,
+                    batch.diagonal,
                     batch.box,
                     batch.intrinsics[:, None].expand(-1, batch.box.shape[1], -1),
                     self.config,
@@ -182,25 +182,31 @@ class Guide(nn.Module):
         posterior = dist.Categorical(logits=q.label_logits)
         missing = batch.category < 0
         category = batch.category.clamp_min(0)
-        if not bool((missing & batch.present).any()):
-            return pyro.sample("label", posterior, obs=category)
-        known = torch.nn.functional.one_hot(category, q.label_logits.shape[-1]).to(q.label_logits)
-        probability = torch.where(missing[..., None], posterior.probs, known)
-        infer = {"enumerate": "parallel", "posterior": posterior}
-        return pyro.sample("label", dist.Categorical(probability), infer=infer)
+        with poutine.mask(mask=missing):  # a known label has no q of its own in the bound
+            if not bool((missing & batch.present).any()):
+                return pyro.sample("label", posterior, obs=category, infer={"is_auxiliary": True})
+            logits = torch.where(missing[..., None], posterior.logits, _certain(category, posterior.logits))
+            infer = {"enumerate": "parallel", "posterior": posterior}
+            return pyro.sample("label", dist.Categorical(logits=logits), infer=infer)
 
     def _instance(self, batch: SceneBatch, q: RegionParameters, label: Tensor) -> None:
-        """q(i | l, I) where an instance is missing: the exact maximiser of the bound, proportional to p(i | l) exp(-KL_i)."""
+        """q(i | l, I) where an instance is missing: the bound's exact maximiser, proportional to p(i | l) exp(-KL_i)."""
         prior = self._prior()
         missing = batch.instance < 0
         if not bool((missing & batch.present).any()):
             return
         latent = prior.category_dim
         kl = kl_to_each_component(q.shape_loc[..., latent:], q.shape_scale[..., latent:], prior.instance_mean())
-        posterior = torch.softmax(prior.instance_log_probability(label) - kl, -1)
-        known = torch.nn.functional.one_hot(batch.instance.clamp_min(0), posterior.shape[-1]).to(posterior)
-        probability = torch.where(missing[..., None], posterior, known)
-        pyro.sample("instance", dist.Categorical(probability), infer={"enumerate": "parallel"})
+        posterior = torch.log_softmax(prior.instance_log_probability(label) - kl, -1)
+        logits = torch.where(missing[..., None], posterior, _certain(batch.instance.clamp_min(0), posterior))
+        with poutine.mask(mask=missing):
+            pyro.sample("instance", dist.Categorical(logits=logits), infer={"enumerate": "parallel"})
+
+
+def _certain(index: Int[Tensor, "b m"], like: Float[Tensor, "*l b m n"]) -> Float[Tensor, "b m n"]:
+    """Log probabilities of what is known: zero for it, -inf for all else (as probabilities they would be rounded up)."""
+    one_hot = torch.nn.functional.one_hot(index, like.shape[-1]).bool()
+    return torch.where(one_hot, 0.0, -torch.inf).to(like.dtype)
 
 
 def _select(raw: Float[Tensor, "b m p o"], predictor: Int[Tensor, "b m"]) -> Float[Tensor, "b m o"]:

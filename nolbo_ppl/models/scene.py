@@ -69,6 +69,24 @@ class SceneBatch:
             **{k: v.to(dtype) if v is not None and v.is_floating_point() else v for k, v in fields.items()}
         )
 
+    def neutral(self) -> SceneBatch:
+        """A copy whose masked values are harmless: a NaN or a zero range under a mask would still reach the gradients."""
+
+        def where(mask: Tensor, value: Tensor, other: float) -> Tensor:
+            return torch.where(mask.view(*mask.shape, *(1,) * (value.dim() - mask.dim())), value, other)
+
+        shapes = {}
+        if self.shape_loc is not None and self.shape_scale is not None:
+            shapes["shape_loc"] = where(self.has_voxels, self.shape_loc, 0.0)
+            shapes["shape_scale"] = where(self.has_voxels, self.shape_scale, 1.0)
+        return self.replace(
+            box=where(self.present, self.box, 0.0),
+            viewpoint=where(self.has_viewpoint, self.viewpoint, 0.0),
+            position=where(self.has_position, self.position, 1.0),
+            diagonal=where(self.has_size, self.diagonal, 1.0),
+            **shapes,
+        )
+
     def __getitem__(self, index: slice | Tensor) -> SceneBatch:
         """Some of the scenes."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}

@@ -29,6 +29,7 @@ from nolbo_ppl.models.distributions import SymmetricMatrixFisher, ViewpointNorma
 from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.prior import LabelPrior
+from nolbo_ppl.models.rotation_term import expected_rotation_log_prob
 from nolbo_ppl.models.scene import SceneBatch, unpack_bits
 from nolbo_ppl.models.shape import VoxelDecoder
 
@@ -93,10 +94,9 @@ class Story(nn.Module):
             kappa = batch.viewpoint.new_tensor(config.rotation_concentration)
             R = viewpoint_to_matrix(batch.viewpoint)
             likelihood = SymmetricMatrixFisher(viewpoint_to_matrix(angles), kappa, batch.symmetry)
-            reverse = SymmetricMatrixFisher(R, kappa, batch.symmetry)  # the density is symmetric in rotation and mode
 
-            def expected(q: dist.TorchDistribution) -> Tensor:
-                return reverse.expected_log_prob(q.mean_rotation())
+            def expected(q: Any) -> Tensor:
+                return expected_rotation_log_prob(q, R, kappa, batch.symmetry)
 
             pyro.sample("rotation", likelihood, obs=R, infer={"expected_log_prob": ("orientation_latent", expected)})
 

@@ -183,10 +183,13 @@ class VonMisesMixture(TorchDistribution):
             concentration = self.concentration.expand(shape).gather(-1, index).squeeze(-1).clamp_min(1e-6)
             return wrap_angle(VonMises(mean, concentration, validate_args=False).sample())
 
+    def component_directions(self) -> Float[Tensor, "*batch K 2"]:
+        """`E[(cos v, sin v)] = A(kappa_k) (cos mu_k, sin mu_k)` of each component, with `A = I1 / I0`."""
+        return bessel_ratio_over_x(self.concentration)[..., None] * self._limited
+
     def mean_direction(self) -> Float[Tensor, "*batch 2"]:
-        """`E[(cos v, sin v)] = sum_k w_k A(kappa_k) (cos mu_k, sin mu_k)` with `A = I1 / I0`."""
-        resultant = bessel_ratio_over_x(self.concentration)
-        return ((self.weights * resultant)[..., None] * self._limited).sum(-2)
+        """`E[(cos v, sin v)]`: the components' mean under their weights."""
+        return (self.weights[..., None] * self.component_directions()).sum(-2)
 
     @property
     def mean(self) -> Float[Tensor, "*batch"]:
