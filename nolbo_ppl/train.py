@@ -89,7 +89,7 @@ class TrainConfig:
     """Steps of the shape autoencoder."""
     single_steps: int = 100
     """Steps on images of one object."""
-    scene_steps: int = 5000
+    scene_steps: int = 6000
     """Steps on scenes."""
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""

@@ -24,11 +24,11 @@ class ModelConfig:
     """Category label of each instance."""
     encoder: Literal["tiny", "darknet19"] = "tiny"
     """Image encoder: a small residual network of stride 16 for CPUs, or the paper's darknet19 of stride 32."""
-    encoder_channels: tuple[int, int, int, int] = (24, 48, 96, 144)
+    encoder_channels: tuple[int, int, int, int] = (16, 32, 80, 144)
     """Channels of the tiny encoder at strides 2, 4, 8 and 16."""
-    encoder_blocks: tuple[int, int, int] = (1, 2, 3)
+    encoder_blocks: tuple[int, int, int] = (1, 1, 2)
     """Residual blocks of the tiny encoder at strides 4, 8 and 16."""
-    head_width: int = 384
+    head_width: int = 320
     """Width of the head's hidden layers (tiny encoder only; darknet19 has a linear head as the paper)."""
     predictors: int = 2
     """Predictors P of each cell; a scene of G x G cells has K = G G P regions."""
@@ -83,15 +83,28 @@ class ModelConfig:
             raise input_error(
                 "one category per instance is needed", got=len(self.instance_category), expected=len(self.instances)
             )
+        if not all(0 <= category < len(self.categories) for category in self.instance_category):
+            raise input_error(
+                "category of an instance", got=self.instance_category, expected=f"labels below {len(self.categories)}"
+            )
+        if self.azimuth_components < 1:
+            raise input_error("azimuth_components", got=self.azimuth_components, expected="at least 1")
+        if self.orientation != "mixture" and self.azimuth_components != 1:
+            raise input_error(
+                f"orientation {self.orientation!r} has one azimuth mode", got=f"{self.azimuth_components} components",
+                expected="azimuth_components=1", do="modes that are never trained would answer queries",
+            )
         if self.instances and self.latent_dim % 2:
             raise input_error("a latent split in two halves", got=self.latent_dim, expected="an even latent_dim")
         if self.image_size % 32 or self.image_size <= 0:
             raise input_error("image_size", got=self.image_size, expected="a positive multiple of 32")
-        if 4 * 2 ** len(self.decoder_channels) != self.voxel_size:
-            raise input_error(
-                "decoder_channels do not reach the voxel grid", got=f"{len(self.decoder_channels)} for {self.voxel_size}",
-                expected="one channel count per doubling of a 4^3 grid",
-            )
+        for name in ("decoder_channels", "voxel_encoder_channels"):
+            channels = getattr(self, name)
+            if 4 * 2 ** len(channels) != self.voxel_size:
+                raise input_error(
+                    f"{name} do not reach the voxel grid", got=f"{len(channels)} for {self.voxel_size}",
+                    expected="one channel count per doubling of a 4^3 grid",
+                )
         if not 0 < self.objectness_epsilon < 0.5:
             raise input_error("objectness_epsilon", got=self.objectness_epsilon, expected="a number in (0, 0.5)")
 
