@@ -221,9 +221,9 @@ def test_sizes_are_metres_of_every_category() -> None:
     from nolbo_ppl.categories import CATEGORIES
 
     assert set(CATEGORIES) <= set(TYPICAL_DIAGONAL)
-    for category in CATEGORIES:  # the parametric families agree with the table to a factor of three
-        median = np.median([shape_from_seed(category, seed).diagonal for seed in range(9)])
-        assert 1 / 3 < median / typical_diagonal(category) < 3
+    for category in CATEGORIES:  # the parametric families agree with the table to a factor of four
+        median = np.median([shape_from_seed(category, seed).diagonal for seed in range(21)])
+        assert 1 / 4 < median / typical_diagonal(category) < 4
 
 
 def write_archive(folder: Path, names: list[str], broken: str | None = None) -> dict[str, np.ndarray]:
