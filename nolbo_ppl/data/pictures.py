@@ -47,9 +47,9 @@ class Photographs:
         if number not in self._kept:
             path = self.paths[number]
             try:
-                with Image.open(path) as picture:
-                    picture.draft("RGB", (2 * self.size, 2 * self.size))
-                    picture = picture.convert("RGB")
+                with Image.open(path) as file:
+                    file.draft("RGB", (2 * self.size, 2 * self.size))
+                    picture = file.convert("RGB")
             except OSError as error:
                 raise input_error("not a readable picture", got=error, file=path) from None
             factor = min(1.0, 2 * self.size / min(picture.size))
@@ -67,8 +67,8 @@ class Photographs:
         side = int(min(picture.shape[:2]) * rng.uniform(0.45, 1.0))
         top = int(rng.integers(picture.shape[0] - side + 1))
         left = int(rng.integers(picture.shape[1] - side + 1))
-        crop = Image.fromarray(picture[top : top + side, left : left + side])
-        crop = np.asarray(crop.resize((width, height), Image.Resampling.BILINEAR, reducing_gap=2.0))
+        square = Image.fromarray(picture[top : top + side, left : left + side])
+        crop = np.asarray(square.resize((width, height), Image.Resampling.BILINEAR, reducing_gap=2.0))
         if rng.random() < 0.5:
             crop = crop[:, ::-1]
         return LINEAR[crop]

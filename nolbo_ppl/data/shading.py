@@ -110,7 +110,7 @@ def surfaces(
                         q[c] += inverse[k, c, d] * (points[i, d] - offset[k, d])
                     q[c] *= material_frequency[m]
                 if material_pattern[m] == 1:
-                    value = noise_at(q[0], q[1], q[2], texture_seed[k], 1, True)
+                    value = float(noise_at(q[0], q[1], q[2], texture_seed[k], 1, True))
                 elif material_pattern[m] == 2:
                     value = wood_at(q[0], q[1], q[2], texture_seed[k])
                 else:
@@ -225,7 +225,7 @@ def illuminate(
             height = -(ex * up[0] + ey * up[1] + ez * up[2])
             cloud = 1.0
             if clouds > 0:
-                cloud += clouds * (noise_at(-4 * ex, -4 * ey, -4 * ez, cloud_seed, 3, True) - 0.5)
+                cloud += float(clouds * (noise_at(-4 * ex, -4 * ey, -4 * ez, cloud_seed, 3, True) - 0.5))
             for c in range(3):
                 colour[i, c] = _sky(height, zenith, horizon, c) * cloud
             continue

@@ -24,7 +24,7 @@ def _lattice(x: np.uint32, y: np.uint32, z: np.uint32, seed: np.uint32) -> np.fl
 
 
 @numba.njit(cache=True)
-def noise_at(x: float, y: float, z: float, seed: int, octaves: int, solid: bool) -> float:
+def noise_at(x: float, y: float, z: float, seed: int, octaves: int, solid: bool) -> np.float32:
     """Fractal noise in [0, 1) at one point; without `solid` the noise is two-dimensional and z is not used."""
     total, weight = np.float32(0), np.float32(0)
     for octave in range(octaves):
@@ -84,7 +84,8 @@ PLANE_PATTERNS: tuple[str, ...] = ("plain", "noise", "checker", "stripes", "tile
 def plane_pattern(pattern: int, u: float, v: float, seed: int) -> float:
     """How much of the second colour a plane shows at (u, v), in [0, 1]; positions in units of the period."""
     if pattern == 1:
-        return min(max(1.6 * noise_at(u, v, 0.0, seed, 4, False) - 0.3, 0.0), 1.0)
+        mix = 1.6 * float(noise_at(u, v, 0.0, seed, 4, False)) - 0.3
+        return min(max(mix, 0.0), 1.0)
     if pattern == 2:
         return float((math.floor(u) + math.floor(v)) % 2)
     if pattern == 3:
