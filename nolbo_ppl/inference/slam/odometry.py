@@ -21,7 +21,7 @@ from nolbo_ppl.inference.slam.graph import (
 from nolbo_ppl.inference.slam.noise import TOO_SMALL
 from nolbo_ppl.inference.slam.state_types import SlamState
 
-WINDOW = 200
+WINDOW = 120
 """Frames the evidence is taken from: where most detections are."""
 STEPS = (4.0, 2.0)
 """Factors tried on each scale, coarse first."""
