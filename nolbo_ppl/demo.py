@@ -1,6 +1,6 @@
 """`nolbo demo`: a short SVI run from scratch with its bound by term, then posteriors of unseen scenes by shipped weights.
 
-The run trains the smallest networks (`nano`) on a thousand generated scenes, enough to watch every term of the bound
+The run trains the smallest networks (`nano`) on two thousand generated scenes, enough to watch every term of the bound
 rise. The queries use the shipped model on scenes and shapes that no training has seen.
 """
 
@@ -50,7 +50,7 @@ class DemoConfig:
     """Steps of the short run's shape autoencoder."""
     scene_steps: int = 600
     """Steps of the short run on scenes."""
-    count: int = 1024
+    count: int = 2048
     """Scenes of the short run."""
     scenes: int = 24
     """Unseen scenes to observe; the one with the most objects is drawn."""
@@ -115,7 +115,7 @@ def training_config(config: DemoConfig) -> TrainConfig:
     return TrainConfig(
         out=config.out / "svi", preset="nano", difficulty="easy", count=config.count, cache=config.out / "cache",
         seed=config.seed, shape_steps=config.shape_steps, single_steps=0, scene_steps=config.scene_steps,
-        batch=32, shape_batch=16, learning_rate=4e-3, augment=False, workers=config.workers, log_every=1,
+        batch=32, shape_batch=16, learning_rate=4e-3, workers=config.workers, log_every=1,
         evaluate_every=max(1, config.scene_steps // 12), evaluate_scenes=128,
         checkpoint_every=max(1, config.scene_steps // 6), threads=0,
     )  # fmt: skip

@@ -81,6 +81,8 @@ def read_image(path: Path) -> np.ndarray:
 def run(config: ObserveConfig) -> ObserveSummary:
     """Observe every image of the folder; `observations.jsonl` appears complete or not at all."""
     paths, model = image_paths(config.images), load(config.model)
+    if config.out.resolve() == config.images.resolve():
+        raise input_error("pictures would be written over the images", got=config.out, do="choose another --out")
     config.out.mkdir(parents=True, exist_ok=True)
     rows = list(_rows(config, paths, model))
     write_jsonl(config.out / "observations.jsonl", rows)

@@ -211,6 +211,9 @@ def _scale(row: dict[str, Any], key: str, length: int, where: dict[str, Any]) ->
     return vector
 
 
+CARRIED = frozenset({"image", "box", "class_posterior", "viewpoint", "azimuth_modes"})
+"""Fields of the observation model's own lines that say more than SLAM uses; they are accepted and left aside."""
+
 _KNOWN = {
     "frame", "position", "position_std", "position_cov", "rotation", "rotation_std", "latent", "latent_std", "objectness",
     "category", "size", "symmetry", "id",
@@ -288,7 +291,7 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
     dimension: int | None = None
     for number, row in read_jsonl(path):
         where = {"file": path, "line": number}
-        unknown = set(row) - _KNOWN
+        unknown = set(row) - _KNOWN - CARRIED
         if unknown:
             raise input_error("unknown field", got=sorted(unknown), expected=f"some of {sorted(_KNOWN)}", **where)
         values = _parse(row, where)

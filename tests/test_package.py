@@ -1,0 +1,145 @@
+"""The package as a whole: what it exports, how light it is, that imports run downwards, that it is fit to be published."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import nolbo_ppl
+from nolbo_ppl.citations import REFERENCES
+from nolbo_ppl.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "nolbo_ppl"
+
+LAYERS = (
+    ("errors", "io", "categories", "citations"),
+    ("geometry", "metrics"),
+    ("models",),
+    ("inference",),
+    ("data", "viz"),
+    ("inference.slam",),
+    ("scenes", "train", "evaluate", "observe", "convert", "slam", "demo"),
+    ("cli",),
+)
+"""From the bottom up: a module imports from its own layer and those before it. SLAM reads the tables of `data`."""
+
+
+def layer_of(module: str) -> int:
+    """Layer of the longest name that the module belongs to."""
+    inside = module.removeprefix("nolbo_ppl.") + "."
+    names = {name: i for i, layer in enumerate(LAYERS) for name in layer if inside.startswith(name + ".")}
+    return names[max(names, key=len)]
+
+
+def imported(path: Path) -> set[str]:
+    """Modules of the package that a file imports when it is loaded."""
+    found: set[str] = set()
+
+    def visit(node: ast.AST) -> None:
+        for child in ast.iter_child_nodes(node):
+            typing_only = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test)
+            if typing_only or isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                continue
+            if isinstance(child, ast.ImportFrom) and child.module and child.module.startswith("nolbo_ppl."):
+                found.add(child.module)
+            if isinstance(child, ast.Import):
+                found.update(alias.name for alias in child.names if alias.name.startswith("nolbo_ppl."))
+            visit(child)
+
+    visit(ast.parse(path.read_text(encoding="utf-8")))
+    return found
+
+
+def modules() -> list[Path]:
+    return sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_run_downwards(path: Path) -> None:
+    name = "nolbo_ppl." + ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+    for module in imported(path):
+        assert layer_of(module) <= layer_of(name), f"{name} imports {module}"
+
+
+def test_the_check_of_imports_sees_an_import() -> None:
+    assert "nolbo_ppl.models.nolbo" in imported(PACKAGE / "train.py")
+    assert layer_of("nolbo_ppl.train") > layer_of("nolbo_ppl.models.nolbo")
+
+
+def test_importing_the_package_is_light() -> None:
+    program = "import sys, nolbo_ppl, nolbo_ppl.cli; print(sorted(set(sys.modules) & {'torch', 'pyro', 'matplotlib', 'gtsam', 'numpy'}))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_queries_do_not_import_what_only_slam_and_pictures_need() -> None:
+    program = (
+        "import sys, nolbo_ppl; nolbo_ppl.load; "
+        "print(sorted(set(sys.modules) & {'matplotlib', 'gtsam', 'trimesh', 'tensorboard', 'networkx.algorithms.clique'}))"
+    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    assert "gtsam" not in done.stdout
+    assert "matplotlib" not in done.stdout
+
+
+def test_version_is_that_of_the_metadata() -> None:
+    assert nolbo_ppl.__version__ == importlib.metadata.version("nolbo_ppl")
+    for file in ("CITATION.cff", "CHANGELOG.md"):
+        assert nolbo_ppl.__version__ in (ROOT / file).read_text(encoding="utf-8")
+
+
+def test_everything_exported_is_there() -> None:
+    for name in nolbo_ppl.__all__:
+        assert getattr(nolbo_ppl, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = nolbo_ppl.nothing
+
+
+def test_citation_tells_the_works_that_are_asked_for() -> None:
+    assert nolbo_ppl.citation("pyro").startswith("@article{bingham2019pyro")
+    assert nolbo_ppl.citation().count("\n@") == len(REFERENCES) - 1
+    with pytest.raises(InputError, match=r"unknown reference: got \['bayes'\]"):
+        nolbo_ppl.citation("bayes")
+
+
+def test_links_at_the_root_are_relative() -> None:
+    for name in ("models", "inference"):
+        assert os.readlink(ROOT / name) == f"nolbo_ppl/{name}"
+
+
+def tracked() -> list[Path]:
+    """Files of the repository; skips where there is no git."""
+    done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip("not a git checkout")
+    return [ROOT / line for line in done.stdout.splitlines() if (ROOT / line).is_file()]
+
+
+def test_no_file_names_a_machine() -> None:
+    pattern = re.compile(rb"/(?:root|home/[a-z]+|work/[a-z]+|Users/[A-Za-z]+)/")
+    for path in tracked():
+        if path != Path(__file__).resolve() and path.suffix in {".py", ".md", ".toml", ".json", ".jsonl", ".cff", ".txt", ""}:
+            assert not pattern.search(path.read_bytes()), path
+
+
+def test_weights_are_small_and_have_a_card() -> None:
+    folders = [path.parent for path in (PACKAGE / "weights").glob("*/config.json")]
+    for folder in folders:
+        assert (folder / "model.safetensors").stat().st_size <= 15e6
+        assert "nolbo train" in (folder / "README.md").read_text(encoding="utf-8")
+        assert not list(folder.glob("*.pt")) + list(folder.glob("*.pkl"))
+
+
+def test_the_licence_is_apache() -> None:
+    text = (ROOT / "LICENSE").read_text(encoding="utf-8")
+    assert text.split()[:5] == ["Apache", "License", "Version", "2.0,", "January"]
+    assert "END OF TERMS AND CONDITIONS" in text
