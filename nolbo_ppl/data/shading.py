@@ -159,7 +159,9 @@ def facing_points(
 
 
 @numba.njit(cache=True)
-def behind_ball(points: np.ndarray, dark: np.ndarray, centre: np.ndarray, radius: np.float32, light: np.ndarray) -> tuple:
+def behind_ball(
+    points: np.ndarray, dark: np.ndarray, centre: np.ndarray, radius: np.float32, light: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the points, not dark yet, whose ray to the light may meet a ball; their offsets from its centre."""
     chosen = np.empty(len(points), dtype=np.int64)
     offset = np.empty((len(points), 3), dtype=np.float32)
