@@ -80,7 +80,7 @@ def parked_tracks(
 ) -> dict[int, np.ndarray]:
     """Median world position of cars whose label stays within `limit` m of it in four fifths of its trusted frames."""
     out = {}
-    car = np.array([k in ("Car", "Van") for k in kinds])
+    car = np.array([k in ("Car", "Van") for k in kinds], dtype=bool)
     for track in np.unique(numbers[car, 1]):
         rows = np.flatnonzero(car & (numbers[:, 1] == track))
         rows = rows[trusted[numbers[rows, 0]] & (np.linalg.norm(poses[rows, :3], axis=1) < 50)]

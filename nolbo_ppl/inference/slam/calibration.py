@@ -61,7 +61,8 @@ def calibrate(state: SlamState) -> SlamState:
     table, rows = state.problem.observations, state.rows
     noise, config = state.noise, state.config
     if len(rows) < LEAST_DETECTIONS:
-        return state
+        unstated = 1.0 if np.isfinite(table.position_covariance[rows]).any() else UNSTATED_FACTOR
+        return replace(state, noise=replace(noise, position_factor=unstated, rotation_factor=unstated))
     frame = table.frame[rows]
     count = np.bincount(state.landmark, minlength=len(state.static))[state.landmark].astype(np.float64)
     report, warnings = dict(noise.report), list(noise.warnings)

@@ -26,6 +26,8 @@ CLIQUE_BUDGET = 5000
 """Cliques looked at in one window before the search is cut."""
 NODE_BUDGET = 400
 """Candidate pairs of one window, the best by evidence."""
+NODES_SEARCHED = 80
+"""Nodes the exact search for cliques runs on."""
 FEATURE_MINIMUM = -6.0
 """Pairs whose features speak against them by more than this many nats join no constellation."""
 
@@ -79,6 +81,33 @@ def joint_log_density(
     return float(-0.5 * (gap.ravel() @ solved + np.linalg.slogdet(2 * np.pi * covariance)[1]))
 
 
+def greedy_clique(together: Bool[np.ndarray, "p p"], seed: int) -> list[int]:
+    """A large clique that holds one node: always add the node that leaves most others possible."""
+    members = [seed]
+    alive = np.flatnonzero(together[seed])
+    while len(alive):
+        left = together[np.ix_(alive, alive)]
+        best = int(np.argmax(left.sum(axis=1)))
+        members.append(int(alive[best]))
+        alive = alive[left[best]]
+    return members
+
+
+def promising_nodes(together: Bool[np.ndarray, "p p"], minimum: int) -> Int[np.ndarray, " n"]:
+    """Nodes of the largest greedy cliques, at most NODES_SEARCHED: the full search on all of them takes a hundred times as long.
+
+    Without features (poles) a window has hundreds of candidate pairs and ten thousands of maximal cliques, most of them tiny.
+    """
+    cliques = [greedy_clique(together, i) for i in np.flatnonzero(together.sum(axis=1) >= minimum - 1)]
+    cliques = sorted((c for c in cliques if len(c) >= minimum), key=len, reverse=True)
+    chosen: set[int] = set()
+    for clique in cliques:
+        if len(chosen) >= NODES_SEARCHED:
+            break
+        chosen.update(clique)
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
 def find_closing(
     pairs: Pairs, estimate: Estimate, samples: PosteriorSamples, config: SlamConfig, *, inflation: float, floor: float,
     log_new: float,
@@ -94,8 +123,7 @@ def find_closing(
     deviation = samples.position[pairs.a] - samples.position[pairs.b]
     # Annealing widens what all pairs share (drift); what tells them apart is local and well known.
     together = consistency(gap, deviation, pairs, min(inflation, 2.0), floor)
-    degree = together.sum(axis=1)
-    nodes = np.flatnonzero(degree >= config.constellation_minimum - 1)
+    nodes = promising_nodes(together, config.constellation_minimum)
     if len(nodes) < config.constellation_minimum:
         return None
     graph = networkx.Graph()

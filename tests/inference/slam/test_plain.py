@@ -33,7 +33,7 @@ def test_the_bound_never_falls(seed: int, latent_dim: int, rotation: float | Non
     _, infos = plain_solve(small(seed, latent_dim, rotation), iterations=8, tolerance=-np.inf)
     bounds = np.array([info.bound for info in infos])
     assert len(bounds) == 8
-    assert bounds[-1] > bounds[0] + 10
+    assert bounds[-1] > bounds[0] + 0.5
     assert np.diff(bounds).min() > -1e-6 * np.abs(bounds).max()
 
 
@@ -51,7 +51,6 @@ def test_error_is_that_of_gtsam() -> None:
 
 def test_evidence_and_weights_equal_enumeration() -> None:
     """One frame, three detections, two landmarks: the sum over all associations written out."""
-    rng = np.random.default_rng(5)
     odometry = np.tile(np.eye(4), (2, 1, 1))
     table = make_table([0, 0, 0], np.array([[0, 0, 5.0], [1, 0, 6.0], [0.5, 0, 5.5]]), position_scale=0.5,
                        objectness=[0.9, 0.6, 0.3])
@@ -72,7 +71,6 @@ def test_evidence_and_weights_equal_enumeration() -> None:
                 marginal[k, j] += p
     assert evidence == pytest.approx(np.log(total), abs=1e-9)
     np.testing.assert_allclose(weights, marginal / total, atol=1e-9)
-    assert rng is not None
 
 
 def test_latent_update_is_the_weighted_mean() -> None:
