@@ -363,7 +363,7 @@ def test_two_processes_learn_what_one_does_with_the_joint_batch(folders: tuple[P
     """In double precision: Adam divides gradients by their own size, and in float32 rounding would be all that is left."""
     script = tmp_path / "train.py"
     script.write_text(DOUBLE_PRECISION, encoding="utf-8")
-    shared: dict[str, Any] = {"voxel_weight": 1e-3, "decode": 100, "freeze": 0.5}  # every network learns in some step
+    shared: dict[str, Any] = {"weights": {"voxels": 1e-3}, "decode": 100, "freeze": 0.5}  # every network learns in some step
     one, two = (config_of(folders, tmp_path / name, **shared) for name in ("one", "two"))
     several = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     for start, config in (([], one), (several, two)):

@@ -111,14 +111,12 @@ class StageRun:
         self.model.load_state_dict(self.state.average)
 
 
-def scene_weights(objective: str, voxels: float | None = None) -> dict[str, float]:
-    """Weights of an objective, where wanted with another weight of the voxels.
+def scene_weights(objective: str, changes: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Weights of an objective, with other weights for some terms.
 
     Voxel terms are thousands of nats an object while the latent is wrong: at full weight they drown every other head.
     """
-    weights = dict(OBJECTIVES[objective])
-    if voxels is not None:
-        weights["voxels"] = voxels
+    weights = {**OBJECTIVES[objective], **(changes or {})}
     return {name: weight for name, weight in weights.items() if weight}
 
 

@@ -22,10 +22,18 @@ import torch
 from jaxtyping import Bool, Float
 from pyro import poutine
 from torch import Tensor, nn
+from torch.distributions import kl_divergence
 
 from nolbo_ppl.geometry.rotation import viewpoint_to_matrix
 from nolbo_ppl.models.config import ModelConfig
-from nolbo_ppl.models.distributions import SymmetricMatrixFisher, ViewpointNormal, ViewpointSinCos
+from nolbo_ppl.models.distributions import (
+    SinCosNormal,
+    SymmetricMatrixFisher,
+    ViewpointMixture,
+    ViewpointNormal,
+    ViewpointSinCos,
+    WrappedNormal,
+)
 from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.prior import LabelPrior
@@ -46,6 +54,15 @@ def expected_normal_log_prob(
     """E_q[log N(y; z, scale^2)] for q(z) of the given mean and variance, summed over dimensions."""
     deviation = ((observed - loc).square() + variance) / scale**2
     return -0.5 * (deviation + math.log(2 * math.pi * scale**2)).sum(-1)
+
+
+def tilt_kl(truth: ViewpointNormal | ViewpointSinCos, q: dist.TorchDistribution) -> Float[Tensor, "*n"]:
+    """KL(p || q) of elevation and in-plane rotation alone, nats: the angles are independent in both."""
+    loc, scale = truth.loc[..., 1:], truth.scale[..., 1:]
+    if isinstance(q, ViewpointMixture):
+        return kl_divergence(WrappedNormal(loc, scale), q.elevation_inplane).sum(-1)
+    kind = SinCosNormal if isinstance(q, ViewpointSinCos) else WrappedNormal
+    return kl_divergence(kind(loc, scale), kind(q.loc[..., 1:], q.scale[..., 1:])).sum(-1)
 
 
 class Story(nn.Module):
@@ -89,7 +106,11 @@ class Story(nn.Module):
                 prior: dist.TorchDistribution = ViewpointSinCos(batch.viewpoint, scale)
             else:
                 prior = ViewpointNormal(batch.viewpoint, scale, order=batch.symmetry)
-            value = pyro.sample("orientation_latent", prior, infer={"truth": prior})
+            parts = {
+                "azimuth_inclusive": lambda q: kl_divergence(prior, q) - tilt_kl(prior, q),
+                "tilt_inclusive": lambda q: tilt_kl(prior, q),
+            }
+            value = pyro.sample("orientation_latent", prior, infer={"truth": prior, "truth_parts": parts})
             angles = torch.atan2(value[..., 0], value[..., 1]) if config.orientation == "sincos" else value
             kappa = batch.viewpoint.new_tensor(config.rotation_concentration)
             R = viewpoint_to_matrix(batch.viewpoint)

@@ -1,0 +1,132 @@
+"""The data of a training run's stages: generated scenes from a cache, or a user's folder."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch.distributed as distributed
+
+from nolbo_ppl.data.augment import Augmentation
+from nolbo_ppl.data.cache import CachedScenes, write_cache
+from nolbo_ppl.data.folder import SceneFolder
+from nolbo_ppl.data.loader import Scenes, prefetch
+from nolbo_ppl.data.scene_config import SceneConfig
+from nolbo_ppl.data.scene_config import preset as scene_preset
+from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.data.supply import Part, SceneSupply, ShapeTable
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.stages import seeded_noise
+from nolbo_ppl.inference.train_config import TrainConfig
+from nolbo_ppl.models.nolbo import Nolbo
+from nolbo_ppl.models.scene import SceneBatch
+
+VALIDATION_SEED = 1000
+"""Added to the seed of generated scenes for the held-out ones: other scenes, other shapes."""
+
+
+class TrainingData:
+    """The data of all stages: generated and cached, or a folder's."""
+
+    def __init__(self, config: TrainConfig, rank: int, world: int) -> None:
+        self.config, self.rank, self.world = config, rank, world
+        self.model = config.model()
+        size = self.model.image_size
+        self.train: Scenes
+        self.single: Scenes
+        self._held_out: Scenes
+        if config.scenes is not None:
+            self._open_folders(config.scenes, size)
+        else:
+            base = scene_preset(config.difficulty, size)
+            backgrounds = None if config.backgrounds is None else str(config.backgrounds)
+            root = config.cache.expanduser() / "scenes"
+            if world > 1 and rank > 0:
+                distributed.barrier()  # the first process renders what is missing
+            single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
+
+            def cached(of: SceneConfig, seed: int, count: int) -> CachedScenes:
+                return write_cache(root, SceneSource(of, seed, backgrounds=backgrounds), count, config.workers)
+
+            train = cached(base, config.seed, config.count)
+            held_out_scenes = cached(base, config.seed + VALIDATION_SEED, max(512, config.evaluate_scenes))
+            self.train, self._held_out = train, held_out_scenes
+            self.single = self.train
+            if config.single_steps:
+                self.single = cached(single, config.seed, config.single_count)
+            if world > 1 and rank == 0:
+                distributed.barrier()
+            self.table, self._held_out_table = ShapeTable(*train.shapes()), ShapeTable(*held_out_scenes.shapes())
+        if len(self.table) == 0 and config.shape_steps:
+            raise input_error("no shapes to learn", got=config.scenes, do="add voxels.npz, or use --shape-steps 0")
+
+    def _open_folders(self, path: Path, size: int) -> None:
+        """A user's folder, and a held-out one or its last tenth."""
+        folder = SceneFolder(path, self.model.categories, size=size)
+        known = 0
+        if self.config.instance_labels:
+            number, _, category = folder.shapes()
+            names = tuple(folder.instances[n] for n in number)
+            self.model = dataclasses.replace(
+                self.model, instances=names, instance_category=tuple(int(c) for c in category)
+            )
+            others = tuple(name for name in folder.instances if name not in set(names))
+            folder = SceneFolder(path, self.model.categories, names + others, size=size)
+            known = len(names)
+        self.train = folder
+        self.table = ShapeTable(*folder.shapes(), known)
+        self.single = folder
+        if self.config.validation is None:
+            cut = len(folder) - max(1, len(folder) // 10)
+            self.train, self._held_out = Part(folder, np.arange(cut)), Part(folder, np.arange(cut, len(folder)))
+            self.single, self._held_out_table = self.train, self.table
+        else:
+            held_out_folder = SceneFolder(self.config.validation, self.model.categories, size=size)
+            self._held_out, self._held_out_table = held_out_folder, ShapeTable(*held_out_folder.shapes())
+
+    def batches(self, stage: str, start: int) -> Iterator[Any]:
+        """Batches of a stage from a step on."""
+        config, latent = self.config, self.model.latent_dim
+        if stage == "shapes":
+            size, rank, world = config.shape_batch, self.rank, self.world
+            part = slice(rank * size // world, (rank + 1) * size // world)
+            seed = 3 * config.seed
+
+            def shapes() -> Iterator[Any]:
+                step = start
+                while True:
+                    yield self.table.batch(config.shape_batch, seed, step, latent, part)
+                    step += 1
+
+            return shapes()
+        supply = SceneSupply(
+            self.single if stage == "single" else self.train, self.table, config.batch,
+            3 * config.seed + (1 if stage == "single" else 2), latent,
+            Augmentation() if config.augment else None, config.sizes, len(self.model.instances), self.rank, self.world,
+        )  # fmt: skip
+
+        def scenes() -> Iterator[SceneBatch]:
+            step = start
+            while True:
+                yield supply.batch(step)
+                step += 1
+
+        return prefetch(scenes())
+
+    def validation(self, count: int | None) -> Iterator[SceneBatch]:
+        """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
+        known = len(self.model.instances)
+        supply = SceneSupply(self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, known_instances=known)
+        total = len(self._held_out) if count is None else min(count, len(self._held_out))
+        for first in range(0, total, 64):
+            batch = supply.prepared(np.arange(first, min(first + 64, total)))
+            yield batch.replace(noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim))
+
+    def teach(self, model: Nolbo) -> None:
+        """Encode the shapes by the trained shape guide, in full precision."""
+        model.set_half_precision(False)
+        self.table.teach(model)
+        self._held_out_table.teach(model)

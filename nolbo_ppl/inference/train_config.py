@@ -1,0 +1,153 @@
+"""The configuration of a training run, and the stages it stands for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.elbo import PURE_BOUND
+from nolbo_ppl.inference.optimisation import OptimisationConfig
+from nolbo_ppl.inference.stages import Stage, scene_weights
+from nolbo_ppl.models.config import PRESETS, ModelConfig
+
+DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
+"""Where rendered scenes are kept between runs."""
+FREE_FIELDS = (
+    "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
+)
+"""Fields a resumed run may change: they do not touch what is learnt."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything a training run depends on."""
+
+    out: Path = Path("runs/tiny")
+    """Folder of the run: configuration, metrics.jsonl, checkpoint, and at the end the model."""
+    preset: Literal["nano", "tiny", "paper"] = "tiny"
+    """Networks: `tiny` for CPUs, `paper` for darknet19 and 64^3 voxels, `nano` for demonstrations."""
+    objective: Literal["inclusive", "elbo", "paper"] = "inclusive"
+    """What is maximised: the inclusive objective, the pure bound, or the paper's (the bound with objectness turned)."""
+    orientation: Literal["mixture", "angle", "sincos"] | None = None
+    """Form of the orientation latent; the preset's by default."""
+    instance_labels: bool = False
+    """Give every instance of `scenes` a label: the latent is split in halves for category and instance."""
+    latent_dim: int | None = None
+    """Dimensions of the shape latent; the preset's by default."""
+    scenes: Path | None = None
+    """Folder of a data set written by `nolbo scenes`, or of your own; without it scenes are generated."""
+    validation: Path | None = None
+    """Folder of held-out scenes; with `scenes` and without this, the last tenth of `scenes` is held out."""
+    count: int = 20480
+    """Number of generated training scenes."""
+    single_count: int = 1024
+    """Number of generated scenes with one object, for the second stage."""
+    difficulty: Literal["easy", "standard", "full"] = "standard"
+    """Difficulty of the generated scenes."""
+    backgrounds: Path | None = None
+    """Folder of photographs behind the generated scenes."""
+    cache: Path = DEFAULT_CACHE
+    """Where generated scenes are kept."""
+    seed: int = 0
+    """Seed of weights, scenes, order, augmentation and noise."""
+    shape_steps: int = 1200
+    """Steps of the shape autoencoder."""
+    single_steps: int = 60
+    """Steps on images of one object."""
+    scene_steps: int = 4600
+    """Steps on scenes."""
+    freeze: float = 1.0
+    """Share of the scene steps during which decoder and prior networks stay frozen."""
+    decode: int = 12
+    """Objects decoded a step where the objective has voxels; their term stands for all objects."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """Weights of single terms (names: `nolbo_ppl.inference.elbo`) in place of the objective's own, as `voxels 0.002`."""
+    batch: int = 64
+    """Scenes a step, over all processes."""
+    shape_batch: int = 32
+    """Shapes a step."""
+    learning_rate: float = 2.5e-3
+    """Rate of the stages on images after their warm-up."""
+    sizes: tuple[int, ...] = ()
+    """Image sides to choose from each step, multiples of 32; empty for the preset's own."""
+    augment: bool = True
+    """Blur, colour, scale and translation at random; never a flip."""
+    bf16: bool = True
+    """Networks in bfloat16."""
+    threads: int = 0
+    """Threads of torch; 0 leaves torch's own choice."""
+    workers: int = 2
+    """Processes that render scenes."""
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl."""
+    evaluate_every: int = 500
+    """Steps between looks at the held-out scenes."""
+    evaluate_scenes: int = 512
+    """Held-out scenes of each look; the calibration at the end uses all."""
+    checkpoint_every: int = 100
+    """Steps between checkpoints."""
+    tensorboard: bool = False
+    """Write TensorBoard files into the run's folder too (needs the extra `tensorboard`)."""
+    resume: bool = True
+    """Go on from the run's checkpoint where there is one; otherwise a folder with a checkpoint is refused."""
+
+    def __post_init__(self) -> None:
+        for name in ("batch", "shape_batch", "log_every", "evaluate_every", "checkpoint_every", "count", "workers"):
+            if getattr(self, name) < 1:
+                raise input_error(name, got=getattr(self, name), expected="at least 1")
+        if not 0 <= self.freeze <= 1:
+            raise input_error("freeze", got=self.freeze, expected="a share from 0 to 1")
+        if any(size % 32 or size <= 0 for size in self.sizes):
+            raise input_error("sizes", got=self.sizes, expected="positive multiples of 32")
+        if self.instance_labels and self.scenes is None:
+            raise input_error("instance labels", got="generated scenes", do="give --scenes with its own instances")
+        if self.validation is not None and self.scenes is None:
+            raise input_error("held-out scenes without training scenes", do="give --scenes too")
+
+    def model(self) -> ModelConfig:
+        """Configuration of the networks."""
+        changes: dict[str, Any] = {}
+        if self.orientation is not None:
+            changes["orientation"] = self.orientation
+            changes["azimuth_components"] = 4 if self.orientation == "mixture" else 1
+        if self.latent_dim is not None:
+            changes["latent_dim"] = self.latent_dim
+        return dataclasses.replace(PRESETS[self.preset](), **changes)
+
+    def stages(self) -> list[Stage]:
+        """The stages that have steps."""
+        weights = scene_weights(self.objective, self.weights)
+        images = OptimisationConfig(learning_rate=self.learning_rate)
+        stages = [
+            Stage(
+                "shapes",
+                OptimisationConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
+                PURE_BOUND,
+            ),
+            Stage(
+                "single",
+                dataclasses.replace(images, steps=self.single_steps, decay=0.0, warmup=min(100, self.single_steps)),
+                weights,
+                freeze=self.single_steps,
+            ),
+            Stage(
+                "scenes",
+                dataclasses.replace(images, steps=self.scene_steps, warmup=min(100, self.scene_steps)),
+                weights,
+                freeze=round(self.freeze * self.scene_steps),
+                decode=self.decode if weights.get("voxels") else 0,
+            ),
+        ]
+        return [stage for stage in stages if stage.optimisation.steps > 0]
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON keeps it."""
+        return json.loads(json.dumps(dataclasses.asdict(self), default=str))
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must agree with: everything but the fields that do not touch what is learnt."""
+        return {key: value for key, value in self.to_json().items() if key not in FREE_FIELDS}
