@@ -13,7 +13,7 @@ from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.inference.measure import SceneTruth
 from nolbo_ppl.inference.observations import Observations
 from nolbo_ppl.metrics.figures import ObjectRecords
-from nolbo_ppl.viz.overlay import draw_frame
+from nolbo_ppl.viz.overlay import draw_frame, show_part
 from nolbo_ppl.viz.shape import draw_shape
 from nolbo_ppl.viz.style import MUTED, TRUTH, category_colour, new_figure, plain, save, styled
 
@@ -108,10 +108,8 @@ def _draw_example(
     half = 0.62 * max(x1 - x0, y1 - y0, 4.0)
     wide = 1.55 * half
     centre = ((x0 + x1) / 2, (y0 + y1) / 2)
-    height, width = truth.image.shape[:2]
     axes.set_facecolor("#e9ecef")
-    axes.imshow(truth.image, extent=(0, width, height, 0), interpolation="lanczos")
-    axes.set(xlim=(centre[0] - wide, centre[0] + wide), ylim=(centre[1] + half, centre[1] - half), aspect="equal")
+    show_part(axes, truth.image, (centre[0] - wide, centre[0] + wide), (centre[1] - half, centre[1] + half))
     if np.isfinite(truth.position[slot]).all() and np.isfinite(truth.R_camera_object[slot]).all():
         # At the true place and at a size that fills the box, so that only the directions differ.
         length = 0.9 * half * float(truth.position[slot, 2] / truth.intrinsics[:2].mean())

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.observations import Observations
-from nolbo_ppl.viz.overlay import draw_box3d, draw_frame, draw_overlay, object_axes
+from nolbo_ppl.viz.overlay import draw_box3d, draw_frame, draw_overlay, object_axes, show_part
 from nolbo_ppl.viz.panels import draw_azimuth, draw_classes, draw_latent, draw_position, draw_range
 from nolbo_ppl.viz.shape import draw_shape, draw_uncertainty
 from nolbo_ppl.viz.style import AXIS_COLOURS, INK, MUTED, category_colour, new_figure, plain, save, styled
@@ -143,8 +143,8 @@ def _draw_closeup(
     x0, y0, x1, y1 = observations.box[index]
     half = 0.62 * max(x1 - x0, y1 - y0, 4.0)
     centre = ((x0 + x1) / 2, (y0 + y1) / 2)
-    axes.imshow(image, extent=(0, image.shape[1], image.shape[0], 0), interpolation="lanczos")
-    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] + half, centre[1] - half), aspect="equal")
+    axes.set_facecolor("#e9ecef")
+    show_part(axes, image, (centre[0] - half, centre[0] + half), (centre[1] - half, centre[1] + half))
     draw_box3d(axes, *object_axes(observations, index), observations.size[index], intrinsics, colour)
     draw_frame(axes, *object_axes(observations, index), 0.5 * observations.diagonal[index], intrinsics)
     axes.set_title("close-up")

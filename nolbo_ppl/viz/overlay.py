@@ -104,15 +104,25 @@ def bearing_range_ellipse(
     return np.array([np.arctan2(x, z), 0.5 * np.log(squared)]) + _outline(jacobian @ covariance @ jacobian.T, nodes)
 
 
+def show_part(
+    axes: Axes, image: UInt8[np.ndarray, "h w 3"], x: tuple[float, float], y: tuple[float, float]
+) -> None:
+    """Show the part of an image between two columns and two rows (px), nothing beyond its borders."""
+    height, width = image.shape[:2]
+    x0, x1 = max(int(np.floor(x[0])), 0), min(int(np.ceil(x[1])), width)
+    y0, y1 = max(int(np.floor(y[0])), 0), min(int(np.ceil(y[1])), height)
+    if x0 < x1 and y0 < y1:
+        axes.imshow(image[y0:y1, x0:x1], extent=(x0, x1, y1, y0), interpolation="lanczos")
+    axes.set(xlim=x, ylim=(y[1], y[0]), aspect="equal")
+
+
 def draw_overlay(
     axes: Axes, image: UInt8[np.ndarray, "h w 3"], observations: Observations, intrinsics: Float[np.ndarray, " 4"]
 ) -> None:
     """Image with boxes, projected 3D boxes, axes, position ellipses and labels."""
     from matplotlib.patches import Rectangle
 
-    height, width = image.shape[:2]
-    axes.imshow(image, extent=(0, width, height, 0), interpolation="lanczos")
-    axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+    show_part(axes, image, (0, image.shape[1]), (0, image.shape[0]))
     plain(axes)
     for i, category in enumerate(observations.category):
         colour = category_colour(category, observations.categories)

@@ -19,6 +19,19 @@ LIGHT = np.array([-0.45, 0.55, 0.7])
 """Direction of the light in the view: right, up, towards the viewer."""
 
 
+MOST_FACES = 40_000
+"""A surface of more triangles is drawn at half the resolution: a shape that is all noise would take minutes."""
+
+
+def surface(occupancy: Float[np.ndarray, "n n n"]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """The 0.5-surface of an occupancy grid, of blocks of voxels where that of single ones is too ragged to draw."""
+    vertices, faces = voxels_to_mesh(occupancy)
+    n = len(occupancy)
+    if len(faces) > MOST_FACES and n % 2 == 0:
+        return surface(np.asarray(occupancy).reshape(n // 2, 2, n // 2, 2, n // 2, 2).mean((1, 3, 5)))
+    return vertices, faces
+
+
 def shape_axes(figure: Figure, place: SubplotSpec, viewpoint: Float[np.ndarray, " 3"]) -> Any:
     """3D axes without frame that look at the canonical box from the estimated viewpoint."""
     from mpl_toolkits.mplot3d import Axes3D
@@ -88,7 +101,7 @@ def draw_shape(
 ) -> Any:
     """Draw the 0.5-surface of an occupancy grid from a viewpoint."""
     axes = shape_axes(figure, place, viewpoint)
-    draw_mesh(axes, *voxels_to_mesh(occupancy), colour)
+    draw_mesh(axes, *surface(occupancy), colour)
     return axes
 
 
@@ -101,7 +114,7 @@ def draw_uncertainty(
 
     colours = colormaps["viridis"]
     axes = shape_axes(figure, place, viewpoint)
-    vertices, faces = voxels_to_mesh(occupancy)
+    vertices, faces = surface(occupancy)
     scale = np.sqrt(np.maximum(face_values(variance, vertices, faces), 0)) if len(faces) else np.zeros(0)
     draw_mesh(axes, vertices, faces, colours(np.clip(scale / 0.5, 0, 1))[:, :3], ambient=0.75)
     x0, y0, width, height = place.get_position(figure).bounds

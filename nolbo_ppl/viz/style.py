@@ -70,7 +70,8 @@ def new_figure(width: float, height: float) -> Figure:
 def save(figure: Figure, path: str | PathLike[str]) -> None:
     """Write a figure as a picture, atomically; the format is that of the suffix."""
     with styled(), atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=DPI)
+        png: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if temporary.suffix == ".png" else {}
+        figure.savefig(temporary, dpi=DPI, **png)
 
 
 def grid(axes: Axes, axis: str = "both") -> None:

@@ -30,7 +30,8 @@ def observations(intrinsics):
     pixel = position[:, :2] / position[:, 2:] * intrinsics[:2] + intrinsics[2:]
     log_posterior = np.log(rng.dirichlet(np.ones(labels), n))
     axis = voxel_centres(v)
-    inside = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2)[None] / np.array([0.1, 0.15, 0.2])[:, None, None, None]
+    squared = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2
+    inside = squared / np.array([0.1, 0.15, 0.2])[:, None, None, None]
     occupancy = 1 / (1 + np.exp(8 * (inside - 1)))
     return Observations(
         categories=CATEGORIES, objectness=np.array([0.9, 0.8, 0.4]), box=np.concatenate((pixel - 15, pixel + 15), 1),

@@ -10,10 +10,11 @@ from scipy.stats import chi2
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import InputError
+from nolbo_ppl.geometry.voxels import voxels_to_mesh
 from nolbo_ppl.viz.observations import draw_observations
 from nolbo_ppl.viz.overlay import bearing_range_ellipse, pixel_ellipse, place_labels, project
 from nolbo_ppl.viz.panels import azimuth_density
-from nolbo_ppl.viz.shape import face_values
+from nolbo_ppl.viz.shape import face_values, surface
 from nolbo_ppl.viz.style import category_colour, new_figure
 
 
@@ -119,6 +120,16 @@ def test_face_values_interpolate_a_linear_field():
     vertices = np.array([[0.1, 0.0, 0.2], [0.2, 0.1, -0.1], [-0.3, 0.05, 0.1]])
     centre = vertices.mean(0)
     assert face_values(field, vertices, np.array([[0, 1, 2]]))[0] == pytest.approx(2 * centre[0] - centre[2])
+
+
+def test_noise_is_drawn_at_a_lower_resolution(monkeypatch):
+    monkeypatch.setattr("nolbo_ppl.viz.shape.MOST_FACES", 2000)
+    noise = np.random.default_rng(4).random((16, 16, 16))
+    vertices, faces = surface(noise)
+    assert 0 < len(faces) <= 2000 and np.abs(vertices).max() <= 0.5
+    solid = np.zeros((16, 16, 16))
+    solid[4:12, 4:12, 4:12] = 1.0
+    np.testing.assert_array_equal(surface(solid)[0], voxels_to_mesh(solid)[0])
 
 
 def test_colours_are_fixed_and_distinct():
