@@ -1,4 +1,4 @@
-"""`nolbo demo`: a short SVI run from scratch with its bound by term, then posteriors of unseen scenes by shipped weights.
+"""`nolbo demo`: a short SVI run from scratch with its bound by term, then posteriors of unseen scenes.
 
 The run trains the smallest networks (`nano`) on two thousand generated scenes, enough to watch every term of the bound
 rise. The queries use the shipped model on scenes and shapes that no training has seen.
@@ -122,7 +122,7 @@ def training_config(config: DemoConfig) -> TrainConfig:
 
 
 def bound_table(config: TrainConfig, end: Mapping[str, float]) -> str:
-    """The bound by term as it rose: of shapes at the steps of the first stage, of held-out scenes at those of the second."""
+    """The bound by term as it rose: of shapes over the first stage, of held-out scenes over the second."""
     history = [row for _, row in read_jsonl(config.out / "metrics.jsonl")]
     shapes = [row for row in history if row["stage"] == "shapes"]
     shapes = [shapes[0], shapes[len(shapes) // 2], shapes[-1]]
@@ -153,10 +153,9 @@ def compare(scene: int, rendered: Rendered, observed: Observations) -> tuple[lis
     result = []
     for i, label in enumerate(labels):
         side, distance = float(np.max(label.box[2:] - label.box[:2])), float(np.linalg.norm(label.position))
-        truth = {"scene": scene, "category": label.category, "visibility": label.visibility, "side": side}
         hits = np.flatnonzero(matched == i)
         answer = _answer(observed, hits[:1], rendered, i) if len(hits) else {}
-        result.append(Found(**truth, distance=distance, **answer))
+        result.append(Found(scene, label.category, label.visibility, side, distance, **answer))
     return result, int((matched < 0).sum())
 
 
@@ -224,7 +223,7 @@ def object_table(objects: Sequence[Found]) -> str:
 
 
 def observe_unseen(config: DemoConfig, model: ObservationModel) -> tuple[list[Found], int, Rendered, Observations]:
-    """Render unseen scenes and observe them; also the scene with the most objects and its posterior, for the picture."""
+    """Observe unseen scenes: objects, spurious detections, and the fullest scene with its posterior."""
     source = SceneSource(preset("standard", model.config.image_size), seed=UNSEEN)
     rendered = [
         source.render(i) for i in tqdm(range(config.scenes), desc="rendering unseen scenes", unit="scene", disable=None)
@@ -261,10 +260,11 @@ def run(config: DemoConfig) -> DemoSummary:
         title=f"Posterior of an unseen scene, model {config.model}",
     )  # fmt: skip
     first = summary.objects[0].scene if summary.objects else 0
+    told = f"{summary.training.steps} steps, {summary.training.seconds:.0f} s; rows in {training.out}/metrics.jsonl"
     summary.text = "\n".join([
         "1. A short SVI run from scratch: the bound by term", "",
         bound_table(training, summary.training.held_out), "",
-        f"   {summary.training.steps} steps in {summary.training.seconds:.0f} s; figures in {training.out}/metrics.jsonl", "",
+        f"   {told}", "",
         f"2. Posterior of unseen scenes by the model {config.model}: the scene of {summary.picture}", "",
         object_table([one for one in summary.objects if one.scene == first]), "",
         f"   over {config.scenes} scenes: " + ", ".join(f"{k} {_plain(v)}" for k, v in summary.figures.items()),

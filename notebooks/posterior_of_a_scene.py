@@ -40,21 +40,21 @@ from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.metrics.detection import match_image
 from nolbo_ppl.viz.observations import draw_observations
 from nolbo_ppl.viz.panels import azimuth_density
-from nolbo_ppl.viz.shape import draw_shape, draw_variance
+from nolbo_ppl.viz.shape import draw_shape, draw_uncertainty
 from nolbo_ppl.viz.style import category_colour
 
 model = nolbo_ppl.load(os.environ.get("NOLBO_MODEL", "tiny"))
 source = SceneSource(preset("standard", model.config.image_size), seed=77_001)
 candidates = [source.render(i) for i in range(8)]
 scene = max(candidates, key=lambda one: sum(label.visibility > 0.5 for label in one.labels))
-print(f"{len(scene.labels)} objects:", ", ".join(label.category for label in scene.labels))
+print("objects:", ", ".join(label.category for label in scene.labels))
 
 # %% [markdown]
 # ## Objectness of every region
 #
 # The encoder's grid has a cell for each patch of the image, and two predictors a cell. Each region k has a Bernoulli
 # $q(o_k \mid I)$. In training it is drawn to $p(o_k \mid l_k)$, which is $1-\epsilon$ for an object and $\epsilon$ for
-# background, by $KL(p \,\|\, q)$: the direction of the paper's training (its lower bound, eq. `ELBO`, has the other one).
+# background, by $KL(p \,\|\, q)$: the direction of the paper's training (its bound, eq. `ELBO`, has the other one).
 
 # %%
 image = torch.from_numpy(scene.image.transpose(2, 0, 1).copy())[None]
@@ -90,7 +90,8 @@ index = int(np.flatnonzero(matched >= 0)[0]) if (matched >= 0).any() else 0
 truth = scene.labels[max(int(matched[index]), 0)]
 colour = category_colour(objects.category[index])
 ray = torch.from_numpy(truth.position)[None]
-true_viewpoint = matrix_to_viewpoint(egocentric_to_allocentric(torch.from_numpy(truth.R_camera_object)[None], ray))[0].numpy()
+true_rotation = egocentric_to_allocentric(torch.from_numpy(truth.R_camera_object)[None], ray)
+true_viewpoint = matrix_to_viewpoint(true_rotation)[0].numpy()
 print(f"observed: {objects.category[index]} ({objects.objectness[index]:.3f}), truth: {truth.category}")
 
 # %% [markdown]
@@ -134,7 +135,7 @@ line.axvline(np.degrees(true_viewpoint[0]), color="black", label="truth")
 for weight, mean, concentration in zip(modes.weights[index], modes.azimuth[index], modes.concentration[index]):
     if weight > 0.01:
         line.axvline(np.degrees(mean), color=colour, lw=0.5 + 2 * weight, ls=":")
-        print(f"mode of weight {weight:.3f} at {np.degrees(mean):7.1f}°, scale {np.degrees(concentration**-0.5):.1f}°")
+        print(f"mode of weight {weight:.3f} at {np.degrees(mean):6.1f}°, scale {np.degrees(concentration**-0.5):.1f}°")
 line.set(xlabel="azimuth, degrees", ylabel="density, 1/rad", ylim=(1e-4, None), title="log density")
 line.legend(frameon=False);
 
@@ -182,9 +183,11 @@ distance = float(np.linalg.norm(mean))
 direction = mean / distance
 log_scale = math.sqrt(float(direction @ covariance @ direction)) / distance
 figure, axes = plt.subplots(1, 2, figsize=(9, 2.6), layout="constrained")
+true_distance = float(np.linalg.norm(truth.position))
+log_diagonal, log_diagonal_scale = math.log(objects.diagonal[index]), float(objects.diagonal_log_scale[index])
 rows = (
-    (axes[0], "distance, m", math.log(distance), log_scale, float(np.linalg.norm(truth.position))),
-    (axes[1], "diagonal of the box, m", math.log(objects.diagonal[index]), float(objects.diagonal_log_scale[index]), truth.size),
+    (axes[0], "distance, m", math.log(distance), log_scale, true_distance),
+    (axes[1], "diagonal of the box, m", log_diagonal, log_diagonal_scale, truth.size),
 )
 for axis, name, centre, scale, true_value in rows:
     x = np.exp(centre + scale * np.linspace(-4, 4, 201))
@@ -210,7 +213,8 @@ for category, row in zip(objects.categories, prior):
     axis.plot(dimension, row, color=colour if own else "#c9ced3", lw=2 if own else 0.7, zorder=2 if own else 1)
 axis.errorbar(dimension, latent, latent_scale, fmt="o", color=colour, capsize=2, label="q(z | I)", zorder=3)
 axis.errorbar(
-    dimension + 0.2, teacher[0], teacher_scale[0], fmt="s", color="black", ms=3, capsize=2, label="q(z | true voxels)", zorder=3
+    dimension + 0.2, teacher[0], teacher_scale[0], fmt="s", color="black", ms=3, capsize=2,
+    label="q(z | true voxels)", zorder=3,
 )
 axis.set(xlabel="dimension", title=f"shape latent, and the prior mean of {objects.category[index]} (line)")
 axis.legend(frameon=False, ncols=2);
@@ -230,7 +234,8 @@ figure, axes = plt.subplots(3, 3, figsize=(8, 7.4), layout="constrained")
 for k, name in enumerate(("from the right", "from the back", "from above")):
     for row, (grid, title) in enumerate(((voxel_mean, "mean"), (voxel_scale, "scale"), (true_voxels, "truth"))):
         panel = axes[row, k]
-        shown = panel.imshow(grid.max(axis=k).T, origin="lower", cmap=("viridis", "magma", "gray")[row], vmin=0, vmax=(1, 0.5, 1)[row])
+        colours, top = (("viridis", 1), ("magma", 0.5), ("gray", 1))[row]
+        shown = panel.imshow(grid.max(axis=k).T, origin="lower", cmap=colours, vmin=0, vmax=top)
         panel.set(xticks=[], yticks=[], title=f"{title}, {name}")
         if k == 2:
             figure.colorbar(shown, ax=panel)
@@ -243,7 +248,7 @@ for place, draw in zip(
     grid,
     (
         lambda place: draw_shape(figure, place, voxel_mean, colour, viewpoint),
-        lambda place: draw_variance(figure, place, voxel_mean, objects.voxel_variance[index], viewpoint),
+        lambda place: draw_uncertainty(figure, place, voxel_mean, objects.voxel_variance[index], viewpoint),
         lambda place: draw_shape(figure, place, true_voxels.astype(float), "#444444", true_viewpoint),
     ),
 ):
@@ -252,9 +257,10 @@ for x, name in ((0.2, "mean shape"), (0.5, "scale of its voxels"), (0.8, "true s
     figure.text(x, 0.96, name, ha="center")
 
 # %% [markdown]
-# `objects.mesh(i)` gives the mesh itself by marching cubes, in metres and the object's own frame; `objects.rows(...)` the
-# lines that `nolbo slam` reads.
+# `objects.mesh(i)` gives the mesh itself by marching cubes, in metres and the object's own frame; `objects.rows(...)`
+# the lines that `nolbo slam` reads.
 
 # %%
 vertices, faces = objects.mesh(index)
-print(f"{len(vertices)} vertices, {len(faces)} faces, extents {np.ptp(vertices, axis=0).round(2)} m, truth {truth.dimensions.round(2)} m")
+print(f"{len(vertices)} vertices, {len(faces)} faces")
+print(f"extents {np.ptp(vertices, axis=0).round(2)} m, truth {truth.dimensions.round(2)} m")

@@ -63,7 +63,8 @@ def test_an_unknown_option_is_refused(verb: str, capsys: pytest.CaptureFixture[s
     [(NolboError("the disc is full"), 2, "nolbo train: the disc is full"), (KeyboardInterrupt(), 130, "interrupted")],
 )
 def test_errors_end_with_a_status_and_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], raised: BaseException, status: int, message: str
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    raised: BaseException, status: int, message: str,
 ) -> None:
     def fail(arguments: list[str]) -> None:
         assert arguments == ["--seed", "1"]
@@ -79,7 +80,8 @@ def test_errors_end_with_a_status_and_one_line(
 
 
 def test_bad_input_of_a_real_run_ends_without_a_traceback(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "nolbo_ppl.cli", "observe", "--images", str(tmp_path), "--out", str(tmp_path / "out")]
+    options = ["--images", str(tmp_path), "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "nolbo_ppl.cli", "observe", *options]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 2
@@ -102,7 +104,7 @@ def documented_commands() -> list[tuple[str, str]]:
 
 def test_documented_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
     commands = documented_commands()
-    assert {text.split()[0] for _, text in commands} >= {"demo", "scenes", "train", "evaluate", "observe", "convert", "slam"}
+    assert {text.split()[0] for _, text in commands} == set(VERBS)
     helps: dict[str, str] = {}
     for document, text in commands:
         verb, *rest = text.split()

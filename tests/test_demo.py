@@ -88,7 +88,7 @@ def test_errors_are_those_that_were_put_in(rendered: Rendered) -> None:
     turn = turn @ viewpoint_to_matrix(torch.tensor([0.0, math.pi / 2, 0.0])).numpy().T
     ray = said.position / np.linalg.norm(said.position, axis=1, keepdims=True)
     wrong = dataclasses.replace(
-        said, R_camera_object=said.R_camera_object @ turn, position=said.position + 0.25 * ray, objectness=said.objectness
+        said, R_camera_object=said.R_camera_object @ turn, position=said.position + 0.25 * ray
     )
     objects, _ = compare(0, rendered, wrong)
     for one, label in zip(objects, rendered.labels):

@@ -104,9 +104,8 @@ def test_a_picture_an_image(model: Path, tmp_path: Path) -> None:
 def test_without_pictures_and_intrinsics_by_the_command_line(
     model: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main([
-        "--images", str(images), "--out", str(tmp_path), "--model", str(model), "--no-pictures", "--threshold", "0.999999",
-    ])  # fmt: skip
+    folders = ["--images", str(images), "--out", str(tmp_path), "--model", str(model)]
+    main([*folders, "--no-pictures", "--threshold", "0.999999"])
     assert "objects in 4 images" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["observations.jsonl"]
 

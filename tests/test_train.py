@@ -62,7 +62,10 @@ def arguments_of(config: TrainConfig) -> list[str]:
     result = []
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), field.name.replace("_", "-")
-        if value == field.default or value == ():
+        if value == field.default or value in ((), {}):
+            continue
+        if isinstance(value, dict):
+            result += [f"--{name}", *(str(part) for item in value.items() for part in item)]
             continue
         result += [f"--{name}" if value else f"--no-{name}"] if isinstance(value, bool) else [f"--{name}", str(value)]
     return result
@@ -117,7 +120,9 @@ def test_metrics_have_a_row_a_step_whose_terms_make_the_loss(uninterrupted: Path
     history = rows(uninterrupted)
     steps = [(row["stage"], row["step"]) for row in history if "loss" in row]
     assert steps == [
-        *(("shapes", i) for i in range(1, 5)), *(("single", i) for i in range(1, 4)), *(("scenes", i) for i in range(1, 7))
+        *(("shapes", i) for i in range(1, 5)),
+        *(("single", i) for i in range(1, 4)),
+        *(("scenes", i) for i in range(1, 7)),
     ]  # fmt: skip
     for row in history:
         if row["stage"] == "shapes":
@@ -202,7 +207,7 @@ def test_a_finished_run_is_left_as_it_is(folders: tuple[Path, Path], uninterrupt
 def test_another_configuration_is_refused(folders: tuple[Path, Path], uninterrupted: Path) -> None:
     with pytest.raises(InputError, match=r"belongs to another configuration: got differing fields \['batch', 'seed'\]"):
         run(config_of(folders, uninterrupted, seed=1, batch=8))
-    with pytest.raises(InputError, match="the folder holds a run.*choose another --out, or resume"):
+    with pytest.raises(InputError, match=r"the folder holds a run.*choose another --out, or resume"):
         run(config_of(folders, uninterrupted, resume=False))
 
 
@@ -220,6 +225,9 @@ def test_logging_and_checkpoints_do_not_touch_what_is_learnt(
     assert list((tmp_path / "tensorboard").iterdir())
 
 
+OPTIONAL = ("category", "instance", "rotation", "position", "size", "visibility", "symmetry")
+
+
 def partly_labelled(folder: Path, out: Path) -> Path:
     """A folder whose objects lack one label or another; one image has boxes alone, one has none at all."""
     (out / "images").mkdir(parents=True)
@@ -228,7 +236,7 @@ def partly_labelled(folder: Path, out: Path) -> Path:
         source = folder / row["image"]
         (out / row["image"]).write_bytes(source.read_bytes())
         for i, thing in enumerate(row["objects"]):
-            for k, name in enumerate(("category", "instance", "rotation", "position", "size", "visibility", "symmetry")):
+            for k, name in enumerate(OPTIONAL):
                 if line == 1 or (line + i) % 7 == k:
                     thing.pop(name, None)
         if line == 2:
@@ -360,10 +368,10 @@ main(sys.argv[1:])
 
 @pytest.mark.slow
 def test_two_processes_learn_what_one_does_with_the_joint_batch(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """In double precision: Adam divides gradients by their own size, and in float32 rounding would be all that is left."""
+    """In double precision: Adam divides gradients by their own size, where float32 has little but rounding."""
     script = tmp_path / "train.py"
     script.write_text(DOUBLE_PRECISION, encoding="utf-8")
-    shared: dict[str, Any] = {"weights": {"voxels": 1e-3}, "decode": 100, "freeze": 0.5}  # every network learns in some step
+    shared: dict[str, Any] = {"weights": {"voxels": 1e-3}, "decode": 100, "freeze": 0.5}  # every network learns
     one, two = (config_of(folders, tmp_path / name, **shared) for name in ("one", "two"))
     several = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     for start, config in (([], one), (several, two)):

@@ -1,4 +1,4 @@
-"""Fit the calibration factors on held-out scenes: one number a head, so that little data is enough and nothing overfits."""
+"""Fit the calibration factors on held-out scenes: one number a head, so that little data is enough."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.nolbo import Nolbo
 from nolbo_ppl.models.scene import SceneBatch
-
 
 LEAST_OBJECTS = 50
 """Fewer held-out objects than this fix no factor."""
@@ -34,10 +33,10 @@ def region_factor(squared: Float[Tensor, " n"], dimensions: int, level: float = 
     return float(torch.sqrt(torch.quantile(squared.double(), level) / chi2.ppf(level, dimensions)))
 
 
-def _fit(loss, start: list[float]) -> list[float]:  # noqa: ANN001
+def _fit(loss, start: list[float]) -> list[float]:
     """Minimise a smooth loss of few parameters with gradients from autograd."""
 
-    def value_and_gradient(x):  # noqa: ANN001, ANN202
+    def value_and_gradient(x):
         parameters = torch.tensor(x, dtype=torch.float64, requires_grad=True)
         value = loss(parameters)
         value.backward()
