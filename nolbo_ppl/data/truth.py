@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.inference.measure import SceneTruth
 
 
+@runtime_checkable
 class Scenes(Protocol):
     """Labelled scenes by number."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -61,6 +61,7 @@ class SceneTruth:
         return (self.side >= least_side) & (self.visibility >= least_visibility)
 
 
+@runtime_checkable
 class ShapeModel(Protocol):
     """What measuring needs of a model besides its observations (`nolbo_ppl.inference.queries.ObservationModel`)."""
 
@@ -77,7 +78,7 @@ class ShapeModel(Protocol):
 
 
 def measure_objects(
-    truth: Sequence[SceneTruth], answers: Sequence[Observations], slots: Sequence[Int[np.ndarray, " k"]],
+    truth: Sequence[SceneTruth], answers: Sequence[Observations], slots: Sequence[Int[np.ndarray, " _"]],
     scenes: Sequence[int], model: ShapeModel,
 ) -> ObjectRecords:
     """Compare the answers at true boxes with the truth.
@@ -228,10 +229,10 @@ def _coarsened(probability: Float[np.ndarray, "n w w w"], side: int) -> Float[np
 
 
 def measure_detections(
-    truth_boxes: Sequence[Float[np.ndarray, "m 4"]],
-    truth_categories: Sequence[Int[np.ndarray, " m"]],
-    counts: Sequence[Bool[np.ndarray, " m"]],
-    answers: Sequence[tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, " n"], Float[np.ndarray, "n labels"]]],
+    truth_boxes: Sequence[Float[np.ndarray, "_ 4"]],
+    truth_categories: Sequence[Int[np.ndarray, " _"]],
+    counts: Sequence[Bool[np.ndarray, " _"]],
+    answers: Sequence[tuple[Float[np.ndarray, "_ 4"], Float[np.ndarray, " _"], Float[np.ndarray, "_ labels"]]],
     labels: int,
     iou_threshold: float = 0.5,
 ) -> DetectionRecords:

@@ -166,6 +166,6 @@ def circular_crps(
     return to_truth - spread / 2
 
 
-def angular_distance(a: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def angular_distance(a: Float[np.ndarray, "*#n"], b: Float[np.ndarray, "*#n"]) -> Float[np.ndarray, "*n"]:
     """Length of the shorter arc between two angles, rad."""
     return np.abs(np.remainder(np.asarray(a) - b + np.pi, 2 * np.pi) - np.pi)

@@ -89,10 +89,10 @@ def match_image(
 
 
 def match(
-    boxes: Sequence[Float[np.ndarray, "n 4"]],
-    scores: Sequence[Float[np.ndarray, " n"]],
-    truth_boxes: Sequence[Float[np.ndarray, "m 4"]],
-    ignores: Sequence[Bool[np.ndarray, " m"]],
+    boxes: Sequence[Float[np.ndarray, "_ 4"]],
+    scores: Sequence[Float[np.ndarray, " _"]],
+    truth_boxes: Sequence[Float[np.ndarray, "_ 4"]],
+    ignores: Sequence[Bool[np.ndarray, " _"]],
     iou_threshold: float = 0.5,
 ) -> Matches:
     """Match the detections of every image and put them in the order of their scores (one entry an image in each list).

@@ -74,7 +74,7 @@ def estimate(
     return Estimate(value, float(low), float(high), count)
 
 
-def wilson_interval(successes: float, trials: int, level: float = 0.95) -> tuple[float, float]:
+def wilson_interval(successes: int | float, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of a proportion (Wilson 1927), for independent trials.
 
     Raises:

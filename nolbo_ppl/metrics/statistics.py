@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 
 Weights = Float[np.ndarray, "b n"]
 """How often each of n objects is in each of b resamples."""
@@ -54,7 +54,7 @@ def mean_of_defined(value: Float[np.ndarray, "b groups"]) -> Float[np.ndarray, "
     return ratio(np.where(defined, value, 0.0).sum(1), defined.sum(1))
 
 
-def ratio(numerator: Float[np.ndarray, "*n"], denominator: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def ratio(numerator: Real[np.ndarray, "*n"], denominator: Real[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Quotient, NaN (without a warning) where the denominator is zero."""
     safe = np.where(denominator > 0, denominator, 1.0)
     return np.where(denominator > 0, numerator / safe, np.nan)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -27,12 +27,14 @@ TRUE_AXES = ("white", "white", "white")
 """Colour of the true axes, drawn dashed."""
 
 
+@runtime_checkable
 class Scenes(Protocol):
     """Labelled scenes by number."""
 
     def __getitem__(self, index: int) -> SceneTruth: ...
 
 
+@runtime_checkable
 class Model(Protocol):
     """What examples need of a model (`nolbo_ppl.inference.queries.ObservationModel`)."""
 
