@@ -26,7 +26,7 @@ from nolbo_ppl.data.workers import parallel
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io import write_json
 
-VERSION = 1
+VERSION = 2
 """Raised when the same seed gives other scenes than before, so that old caches are not taken for new ones."""
 
 

@@ -18,13 +18,13 @@ class SceneConfig:
     """Height and width of the image, px; a multiple of 32."""
     categories: tuple[str, ...] = CATEGORIES
     """Categories drawn, each as often as the others."""
-    objects: tuple[int, int] = (1, 5)
+    objects: tuple[int, int] = (1, 4)
     """Number of objects tried in a scene; fewer remain where there is no room."""
     empty_probability: float = 0.03
     """Share of scenes without any object."""
-    clutter: tuple[int, int] = (0, 3)
+    clutter: tuple[int, int] = (0, 2)
     """Number of things that are no object."""
-    object_pixels: tuple[float, float] = (18.0, 0.9)
+    object_pixels: tuple[float, float] = (26.0, 0.9)
     """Projected box diagonal of an object: least in px, greatest as a share of the image size; drawn log-uniformly."""
     clutter_pixels: tuple[float, float] = (8.0, 0.6)
     """The same for clutter."""
@@ -44,31 +44,31 @@ class SceneConfig:
     """Scale (standard deviation) of the roll of the camera, degrees, cut at three times that."""
     flying_probability: float = 0.4
     """Share of aeroplanes that are in the air, banked and pitched."""
-    near_probability: float = 0.25
+    near_probability: float = 0.2
     """Share of objects placed beside one that is there already, so that they occlude each other."""
-    truncation_probability: float = 0.1
+    truncation_probability: float = 0.06
     """Share of objects whose centre may lie anywhere in the image, so that its border cuts them."""
     least_visibility: float = 0.15
     """Objects of which less is seen are taken out of the scene (not only out of the labels)."""
     least_box: float = 5.0
     """Objects whose box has a side below this many px are taken out of the scene too."""
-    backgrounds: tuple[float, float, float, float] = (0.35, 0.35, 0.2, 0.1)
+    backgrounds: tuple[float, float, float, float] = (0.5, 0.3, 0.15, 0.05)
     """Weights of: plain ground and sky, textured ground and sky, a room with a wall, a drawn picture."""
     photographs: float = 0.5
     """Share of scenes before a photograph, when a folder of photographs is given."""
-    muted: float = 0.85
+    muted: float = 0.9
     """Share of grounds and walls in muted colours."""
     sun_elevation: tuple[float, float] = (25.0, 80.0)
     """Height of the main light, degrees."""
     second_light_probability: float = 0.25
     """Share of scenes with a second, weaker light; it throws shadows too."""
-    tint: float = 0.12
+    tint: float = 0.1
     """Greatest departure of the light's channels from white, as a share."""
     exposure: tuple[float, float] = (0.75, 1.25)
     """Factor on the light that reaches the sensor."""
     blur: float = 0.5
     """Greatest scale of the blur, px."""
-    noise: float = 0.015
+    noise: float = 0.01
     """Greatest scale of the sensor noise, over full range."""
     supersample: int = 1
     """Rays a pixel along each side; 2 costs four times the rays and removes jagged edges."""

@@ -42,7 +42,7 @@ class TrainConfig:
     """Folder of a data set written by `nolbo scenes`, or of your own; without it scenes are generated."""
     validation: Path | None = None
     """Folder of held-out scenes; with `scenes` and without this, the last tenth of `scenes` is held out."""
-    count: int = 20480
+    count: int = 16384
     """Number of generated training scenes."""
     single_count: int = 1024
     """Number of generated scenes with one object, for the second stage."""
@@ -58,7 +58,7 @@ class TrainConfig:
     """Steps of the shape autoencoder."""
     single_steps: int = 60
     """Steps on images of one object."""
-    scene_steps: int = 4600
+    scene_steps: int = 4500
     """Steps on scenes."""
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""
