@@ -58,7 +58,7 @@ class TrainConfig:
     """Steps of the shape autoencoder."""
     single_steps: int = 60
     """Steps on images of one object."""
-    scene_steps: int = 4500
+    scene_steps: int = 4000
     """Steps on scenes."""
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""
@@ -84,7 +84,7 @@ class TrainConfig:
     """Processes that render scenes."""
     log_every: int = 20
     """Steps between rows of metrics.jsonl."""
-    evaluate_every: int = 500
+    evaluate_every: int = 1000
     """Steps between looks at the held-out scenes."""
     evaluate_scenes: int = 512
     """Held-out scenes of each look; the calibration at the end uses all."""
