@@ -90,11 +90,21 @@ def simulated(arguments: Arguments, kind: str) -> Iterator[tuple[str, dict[str, 
         spread = np.array([result.landmarks[j].position_covariance for j in known])
         before, after = ate(drive.odometry, truth), ate(result.T_world_camera, truth)
         best = ate(oracle.estimate.T_world_camera, truth)
-        yield f"{kind} {seed}", {
-            "before": before, "after": after, "oracle": best, "after/oracle": after / best, "after/before": after / before,
-            "precision": score.precision, "recall": score.recall,
-            "nees_pose": float(normalised_error_squared(error, covariance).mean()),
-            "nees_landmark": float(normalised_error_squared(gap, spread).mean()), "seconds": sum(result.seconds.values())}
+        yield (
+            f"{kind} {seed}",
+            {
+                "before": before,
+                "after": after,
+                "oracle": best,
+                "after/oracle": after / best,
+                "after/before": after / before,
+                "precision": score.precision,
+                "recall": score.recall,
+                "nees_pose": float(normalised_error_squared(error, covariance).mean()),
+                "nees_landmark": float(normalised_error_squared(gap, spread).mean()),
+                "seconds": sum(result.seconds.values()),
+            },
+        )
 
 
 def converted(name: str, data: Converted, gap: int) -> tuple[SlamResult, dict[str, float]]:
@@ -111,9 +121,17 @@ def converted(name: str, data: Converted, gap: int) -> tuple[SlamResult, dict[st
     before = ate(problem.odometry, truth, data.trusted)
     after = ate(result.T_world_camera, truth, data.trusted)
     best = ate(oracle.estimate.T_world_camera, truth, data.trusted)
-    return result, {"before": before, "after": after, "oracle": best, "after/oracle": after / best,
-                    "after/before": after / before, "precision": loops.precision, "recall": loops.recall, "f1": pairs.f1,
-                    "seconds": sum(result.seconds.values())}
+    return result, {
+        "before": before,
+        "after": after,
+        "oracle": best,
+        "after/oracle": after / best,
+        "after/before": after / before,
+        "precision": loops.precision,
+        "recall": loops.recall,
+        "f1": pairs.f1,
+        "seconds": sum(result.seconds.values()),
+    }
 
 
 def objects_right(result: SlamResult, data: Converted) -> dict[str, float]:
@@ -141,7 +159,9 @@ def runs(arguments: Arguments, kind: str) -> Iterator[tuple[str, dict[str, float
     elif kind == "poles":
         for sequence in arguments.sequences or ("00", "02", "08"):
             for seed in range(arguments.seeds):
-                data = convert_kitti_poles(arguments.data / "kitti_odometry", sequence, every=arguments.every, seed=seed)
+                data = convert_kitti_poles(
+                    arguments.data / "kitti_odometry", sequence, every=arguments.every, seed=seed
+                )
                 yield f"poles {sequence} {seed}", converted("poles", data, 50)[1]
     elif kind == "tracking":
         for sequence in arguments.sequences or ("0001", "0009"):
@@ -167,8 +187,14 @@ def main() -> None:
             print(name, "  ".join(f"{k} {v:.3f}" for k, v in row.items()), flush=True)
         for key in rows[0]:
             values = np.array([row[key] for row in rows])
-            worst = values.min() if key in ("precision", "recall", "f1", "object_right", "object_position_right") else values.max()
-            lines.append(f"| {kind} | {key} | {values.mean():.3f} | {np.median(values):.3f} | {worst:.3f} | {len(values)} |")
+            worst = (
+                values.min()
+                if key in ("precision", "recall", "f1", "object_right", "object_position_right")
+                else values.max()
+            )
+            lines.append(
+                f"| {kind} | {key} | {values.mean():.3f} | {np.median(values):.3f} | {worst:.3f} | {len(values)} |"
+            )
     print("\n| scenario | figure | mean | median | worst | runs |\n|---|---|---|---|---|---|")
     print("\n".join(lines))
 

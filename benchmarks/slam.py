@@ -83,7 +83,9 @@ def main() -> None:
         report["batch_1000"], report["batch_4541"] = part, whole
         report["growth_over_linear"] = whole["em"] / part["em"] / (whole["keyframes"] / part["keyframes"])
     if arguments.online:
-        report["online"] = time_online(*(make_drive(arguments.data, 1, arguments.seed) if arguments.large else (drive, config)))
+        report["online"] = time_online(
+            *(make_drive(arguments.data, 1, arguments.seed) if arguments.large else (drive, config))
+        )
     print(json.dumps(report, indent=2))
 
 

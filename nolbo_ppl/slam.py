@@ -21,7 +21,9 @@ class SlamArguments:
     """Correct a drifting trajectory by the objects seen along it, and map them with uncertainty."""
 
     odometry: Path
-    """Odometry: KITTI (12 numbers a row) or TUM (`time x y z qx qy qz qw`), T_world_camera, x right, y down, z forward."""
+    """Odometry: KITTI (12 numbers a row) or TUM (`time x y z qx qy qz qw`), T_world_camera, x right, y down, z
+    forward.
+    """
     observations: Path
     """Observations: JSON Lines, one detection a line (see docs/slam.md)."""
     out: Path
@@ -48,8 +50,11 @@ def matched_truth(odometry: Trajectory, path: Path) -> np.ndarray:
                           expected=f"{len(odometry)} rows", file=path)
     rows, partner = match_times(odometry.times, truth.times)
     if len(rows) < len(odometry):
-        raise input_error("truth lacks times of the odometry", got=f"{len(rows)} of {len(odometry)} rows matched within 20 ms",
-                          file=path)
+        raise input_error(
+            "truth lacks times of the odometry",
+            got=f"{len(rows)} of {len(odometry)} rows matched within 20 ms",
+            file=path,
+        )
     return truth.T_world_camera[partner]
 
 

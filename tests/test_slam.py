@@ -29,8 +29,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(folder: Path, out: Path, **change: str) -> list[str]:
-    values = {"odometry": str(folder / "odometry.txt"), "observations": str(folder / "observations.jsonl"), "out": str(out),
-              **change}
+    values = {
+        "odometry": str(folder / "odometry.txt"),
+        "observations": str(folder / "observations.jsonl"),
+        "out": str(out),
+        **change,
+    }
     return [part for name, value in values.items() for part in (f"--{name}", value)]
 
 
@@ -57,7 +61,11 @@ def test_every_file_is_written(folder: Path, tmp_path: Path, capsys: pytest.Capt
 
 def test_kitti_in_kitti_out_and_no_observations(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "none.jsonl").write_text("")
-    main(arguments(folder, tmp_path / "out", odometry=str(folder / "kitti.txt"), observations=str(tmp_path / "none.jsonl")))
+    main(
+        arguments(
+            folder, tmp_path / "out", odometry=str(folder / "kitti.txt"), observations=str(tmp_path / "none.jsonl")
+        )
+    )
     back = read_trajectory(tmp_path / "out" / "trajectory.txt")
     assert back.format == "kitti"
     np.testing.assert_allclose(back.T_world_camera, read_trajectory(folder / "kitti.txt").T_world_camera, atol=1e-6)
@@ -67,7 +75,11 @@ def test_kitti_in_kitti_out_and_no_observations(folder: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("observations", '{"frame": 0, "position": [0, 0, 1]}\n{"frame": 500, "position": [0, 0, 1]}\n', ":2: .*out of range"),
+        (
+            "observations",
+            '{"frame": 0, "position": [0, 0, 1]}\n{"frame": 500, "position": [0, 0, 1]}\n',
+            ":2: .*out of range",
+        ),
         ("observations", '{"frame": 0, "position": [0, 0', ":1: not a line of JSON"),
         ("odometry", "1 2 3\n", "unknown trajectory format"),
         ("truth", "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "truth lacks times"),
@@ -86,7 +98,9 @@ def test_errors_go_to_stderr_and_nothing_is_written(
     assert not (tmp_path / "out").exists()
 
 
-def test_interruption_leaves_no_half_written_file(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interruption_leaves_no_half_written_file(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import nolbo_ppl.inference.slam.export as export
 
     def interrupted(*_: object) -> None:

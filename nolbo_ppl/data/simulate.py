@@ -1,4 +1,5 @@
-"""Simulated object SLAM on any true trajectory: a world of objects along the way, noisy detections, drifting odometry."""
+"""Simulated object SLAM on any true trajectory: a world of objects along the way, noisy detections, drifting odometry.
+"""
 
 from __future__ import annotations
 
@@ -123,8 +124,14 @@ def simulate_world(
 
 
 def simulate_odometry(
-    truth: Float[np.ndarray, "n 4 4"], rng: np.random.Generator, *, rotation_scale: float, translation_scale: float = 0.0,
-    translation_ratio: float = 0.0, planar: bool = False, length_scale: float = 1.0,
+    truth: Float[np.ndarray, "n 4 4"],
+    rng: np.random.Generator,
+    *,
+    rotation_scale: float,
+    translation_scale: float = 0.0,
+    translation_ratio: float = 0.0,
+    planar: bool = False,
+    length_scale: float = 1.0,
 ) -> Float[np.ndarray, "n 4 4"]:
     """Chain the true steps with white noise on each: rad an axis, m an axis, and m an axis per m of the step.
 
@@ -163,7 +170,9 @@ def simulate_detections(
         clutter = int(rng.poisson(config.clutter_rate))
         depth = rng.uniform(config.minimum_range, config.maximum_range, clutter)
         angle = rng.uniform(-0.5, 0.5, clutter) * config.field_of_view
-        false = np.stack([depth * np.sin(angle), 1.0 + 0.3 * rng.standard_normal(clutter), depth * np.cos(angle)], axis=1)
+        false = np.stack(
+            [depth * np.sin(angle), 1.0 + 0.3 * rng.standard_normal(clutter), depth * np.cos(angle)], axis=1
+        )
         frames.append(np.full(len(rows) + clutter, t))
         points.append(np.concatenate([local[rows], false]))
         sources.append(np.concatenate([rows, np.full(clutter, -1)]))

@@ -49,7 +49,8 @@ def quaternion_to_matrix(quaternion: Float[np.ndarray, "... 4"]) -> Float[np.nda
 
 
 def matrix_to_quaternion(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "... 4"]:
-    """Quaternion [qx, qy, qz, qw] with qw >= 0, by the largest of the four candidates (never divides by a small one)."""
+    """Quaternion [qx, qy, qz, qw] with qw >= 0, by the largest of the four candidates (never divides by a small one).
+    """
     R = np.asarray(R, dtype=np.float64)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the outer product of the quaternion with itself: its best-conditioned column is the quaternion.

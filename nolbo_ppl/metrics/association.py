@@ -53,7 +53,10 @@ def _pairs_apart(frame: np.ndarray, label: np.ndarray, gap: int) -> int:
 
 
 def association_pairs(
-    frame: Int[np.ndarray, " k"], object_of: Int[np.ndarray, " k"], landmark_of: Int[np.ndarray, " k"], minimum_gap: int = 0
+    frame: Int[np.ndarray, " k"],
+    object_of: Int[np.ndarray, " k"],
+    landmark_of: Int[np.ndarray, " k"],
+    minimum_gap: int = 0,
 ) -> PairScore:
     """Score of an association over pairs of detections more than `minimum_gap` frames apart.
 
@@ -81,7 +84,9 @@ def association_pairs(
     )
 
 
-def normalised_error_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, " n"]:
+def normalised_error_squared(
+    error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]
+) -> Float[np.ndarray, " n"]:
     """NEES per degree of freedom, `e' S^-1 e / d` (Bar-Shalom): 1 on average when covariances are right.
 
     Raises:

@@ -101,7 +101,8 @@ def align(
 def absolute_trajectory_error(
     T_estimate: Float[np.ndarray, "n 4 4"], T_truth: Float[np.ndarray, "n 4 4"], alignment: Alignment = "se3"
 ) -> ErrorSummary:
-    """Distance between estimated and true positions in m after alignment (Sturm et al. 2012; evo's APE, translation part).
+    """Distance between estimated and true positions in m after alignment (Sturm et al. 2012; evo's APE, translation
+    part).
 
     Raises:
         InputError: shapes differ, no rows, values not finite, or an unknown alignment.

@@ -54,7 +54,9 @@ def test_poles_are_seen_where_they_are(tmp_path: Path) -> None:
         assert name is not None
         np.testing.assert_allclose(point, expected[name], atol=1e-4)
     again = convert_kitti_poles(tmp_path, "00", seed=1)
-    np.testing.assert_array_equal(again.observations.position, convert_kitti_poles(tmp_path, "00", seed=1).observations.position)
+    np.testing.assert_array_equal(
+        again.observations.position, convert_kitti_poles(tmp_path, "00", seed=1).observations.position
+    )
 
 
 def test_poles_noise_misses_and_clutter_are_as_stated(tmp_path: Path) -> None:
@@ -113,8 +115,10 @@ def test_ycbv_rows_of_zeros_are_no_detections(tmp_path: Path) -> None:
     rows = np.concatenate([local[:, :3, 3], matrix_to_quaternion(local[:, :3, :3])], axis=1)
     detected = rows.copy()
     detected[::2] = 0.0
-    np.savez(tmp_path / "0001.npz", **{"t": np.arange(n) / 10, "cam_gt": truth, "odom_est": truth, "det_initial/box": detected,
-                                       "gt/box": rows})
+    np.savez(
+        tmp_path / "0001.npz",
+        **{"t": np.arange(n) / 10, "cam_gt": truth, "odom_est": truth, "det_initial/box": detected, "gt/box": rows},
+    )
     data = convert_ycbv_slam(tmp_path, "0001", every=3, rotation_drift=0.0, translation_drift=0.0)
     assert len(data.odometry) == 10 and len(data.observations) == 5
     np.testing.assert_allclose(data.T_world_object["box"], world, atol=1e-9)
@@ -133,8 +137,12 @@ def test_real_files_convert_and_read_back(data_dir: Path, tmp_path: Path) -> Non
     world = transform(data.truth.T_world_camera[data.observations.frame], data.observations.position)
     parked = [o for o in data.T_world_object if sum(x == o for x in data.objects) > 20]
     assert len(parked) > 10
-    spread = [np.median(np.abs(world[[x == o for x in data.objects]] - np.median(world[[x == o for x in data.objects]], axis=0)))
-              for o in parked]
+    spread = [
+        np.median(
+            np.abs(world[[x == o for x in data.objects]] - np.median(world[[x == o for x in data.objects]], axis=0))
+        )
+        for o in parked
+    ]
     assert np.median(spread) < 0.15
     box = convert_ycbv_slam(data_dir / "ycbv_slam", "0033")
     assert box.odometry.format == "tum" and len(box.observations) > 50

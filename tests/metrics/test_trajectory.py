@@ -46,7 +46,9 @@ def test_alignment_is_the_minimum_over_rigid_motions() -> None:
     def rmse(xi: np.ndarray) -> float:
         return absolute_trajectory_error(se3_exp(xi) @ estimate, truth, "none").rmse
 
-    best = min(minimize(rmse, start, method="BFGS").fun for start in 3 * np.random.default_rng(4).standard_normal((8, 6)))
+    best = min(
+        minimize(rmse, start, method="BFGS").fun for start in 3 * np.random.default_rng(4).standard_normal((8, 6))
+    )
     assert found == pytest.approx(best, abs=1e-6)
 
 
@@ -58,7 +60,9 @@ def test_origin_alignment_starts_at_the_truth() -> None:
 def test_errors_are_invariant_to_a_rigid_motion() -> None:
     estimate, truth = walk(40, 7), walk(40, 8)
     moved = se3_exp(np.array([0.5, 0.2, -2.0, 10.0, -3.0, 4.0])) @ estimate
-    assert absolute_trajectory_error(moved, truth).rmse == pytest.approx(absolute_trajectory_error(estimate, truth).rmse)
+    assert absolute_trajectory_error(moved, truth).rmse == pytest.approx(
+        absolute_trajectory_error(estimate, truth).rmse
+    )
     assert relative_pose_error(moved, truth).rmse == pytest.approx(relative_pose_error(estimate, truth).rmse)
 
 

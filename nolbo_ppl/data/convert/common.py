@@ -37,7 +37,9 @@ class Converted:
 
 
 def write_converted(out: str | PathLike[str], data: Converted) -> None:
-    """Write `odometry.txt`, `truth.txt`, `observations.jsonl`, `objects.json` (true object of each id) and `source.json`."""
+    """Write `odometry.txt`, `truth.txt`, `observations.jsonl`, `objects.json` (true object of each id) and
+    `source.json`.
+    """
     out = Path(out)
     write_trajectory(out / "odometry.txt", data.odometry)
     write_trajectory(out / "truth.txt", data.truth)

@@ -59,7 +59,9 @@ def convert_kitti_poles(
     table, source = simulate_detections(truth, objects, detector, np.random.default_rng(seed))
     plain = make_table(table.frame, table.position, position_covariance=table.position_covariance,
                        category=["pole"] * len(table), id=table.id)
-    poses = {f"pole-{j}": np.block([[np.eye(3), world[j][:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) for j in range(m)}
+    poses = {
+        f"pole-{j}": np.block([[np.eye(3), world[j][:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) for j in range(m)
+    }
     settings = {"kind": "kitti-poles", "sequence": sequence, "odometry": odometry, "every": every, "seed": seed,
                 "position_scale": position_scale, "position_ratio": position_ratio, "miss_rate": miss_rate,
                 "clutter_rate": clutter_rate, "maximum_range": maximum_range, "field_of_view": field_of_view}

@@ -17,7 +17,9 @@ from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 
 
 def planar_poses(states: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:
-    """Camera poses (x right, y down, z forward) of rows X forward, Y left, theta to the left, in the frame of camera 0."""
+    """Camera poses (x right, y down, z forward) of rows X forward, Y left, theta to the left, in the frame of camera
+    0.
+    """
     R = so3_exp(-states[:, 2:3] * np.array([0.0, 1.0, 0.0]))
     return make_pose(R, np.stack([-states[:, 1], np.zeros(len(states)), states[:, 0]], axis=1))
 
@@ -75,8 +77,12 @@ def read_labels(path: str | PathLike[str]) -> tuple[Int[np.ndarray, "k 2"], Floa
 
 
 def parked_tracks(
-    numbers: Int[np.ndarray, "k 2"], poses: Float[np.ndarray, "k 4"], kinds: list[str], truth: Float[np.ndarray, "n 4 4"],
-    trusted: Bool[np.ndarray, " n"], limit: float = 1.0,
+    numbers: Int[np.ndarray, "k 2"],
+    poses: Float[np.ndarray, "k 4"],
+    kinds: list[str],
+    truth: Float[np.ndarray, "n 4 4"],
+    trusted: Bool[np.ndarray, " n"],
+    limit: float = 1.0,
 ) -> dict[int, np.ndarray]:
     """Median world position of cars whose label stays within `limit` m of it in four fifths of its trusted frames."""
     out = {}

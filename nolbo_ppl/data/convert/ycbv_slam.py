@@ -58,8 +58,9 @@ def convert_ycbv_slam(
         arrays = {name: file[name] for name in file.files}
     names = sorted(name.split("/", 1)[1] for name in arrays if name.startswith(f"{detections}/"))
     if not names:
-        raise input_error("no such detections", got=detections, expected="det_initial, det_selftrained or det_supervised",
-                          file=path)
+        raise input_error(
+            "no such detections", got=detections, expected="det_initial, det_selftrained or det_supervised", file=path
+        )
     keep = np.arange(0, len(arrays["t"]), every)
     truth = poses_of(arrays["cam_gt"][keep])
     steps = relative(*(lambda T: (T[:-1], T[1:]))(poses_of(arrays["odom_est"][keep])))

@@ -23,7 +23,8 @@ CLIP = 3.0
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
 UNSTATED_FACTOR = 4.0
-"""Least factor where nobody stated a scale: detectors are biased by view, which residuals about one track do not show."""
+"""Least factor where nobody stated a scale: detectors are biased by view, which residuals about one track do not show.
+"""
 LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
@@ -31,7 +32,9 @@ LEAST_DETECTIONS = 30
 def correlation_factor(
     whitened: Float[np.ndarray, "k c"], track: Int[np.ndarray, " k"], frame: Int[np.ndarray, " k"]
 ) -> float:
-    """Factor on covariances that makes up for correlated errors: `(1 + r) / (1 - r)` of a first-order process, at least 1."""
+    """Factor on covariances that makes up for correlated errors: `(1 + r) / (1 - r)` of a first-order process, at
+    least 1.
+    """
     order = np.lexsort((frame, track))
     z = np.clip(whitened[order], -CLIP, CLIP)
     follows = (np.diff(track[order]) == 0) & (np.diff(frame[order]) <= 2)
@@ -56,7 +59,8 @@ def _width(whitened: np.ndarray, count: np.ndarray) -> float:
 def calibrate(state: SlamState) -> SlamState:
     """Widen position and rotation scales to the residuals about the solved tracks, and account for their correlation.
 
-    Scales the user stated are widened only when they are too small by more than a third (reported) and `correct_scales`.
+    Scales the user stated are widened only when they are too small by more than a third (reported) and
+    `correct_scales`.
     """
     table, rows = state.problem.observations, state.rows
     noise, config = state.noise, state.config
@@ -66,7 +70,9 @@ def calibrate(state: SlamState) -> SlamState:
     frame = table.frame[rows]
     count = np.bincount(state.landmark, minlength=len(state.static))[state.landmark].astype(np.float64)
     report, warnings = dict(noise.report), list(noise.warnings)
-    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
+    predicted = transform(
+        inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
+    )
     whitening = np.linalg.inv(np.linalg.cholesky(noise.position_covariance[rows]))
     z = np.einsum("kij,kj->ki", whitening, table.position[rows] - predicted)
     ratio = _width(z, count)
@@ -94,7 +100,9 @@ def calibrate(state: SlamState) -> SlamState:
                               np.nan_to_num(max(ratio, 1.0), nan=1.0))
             report["rotation_track_width"] = ratio
             least = 1.0 if stated[k].any() else UNSTATED_FACTOR
-            report["rotation_correlation_factor"] = rotation_factor = max(correlation_factor(w, j, table.frame[k]), least)
+            report["rotation_correlation_factor"] = rotation_factor = max(
+                correlation_factor(w, j, table.frame[k]), least
+            )
             noise = replace(noise, rotation_scale=noise.rotation_scale * factor, rotation_factor=rotation_factor)
     clean = {name: value for name, value in report.items() if np.isfinite(value)}
     return replace(state, noise=replace(noise, report=clean, warnings=tuple(dict.fromkeys(warnings))))
@@ -104,5 +112,7 @@ def _stated_factor(ratio: float, name: str, stated: np.ndarray, correct: bool, w
     if not stated.any() or not np.isfinite(ratio) or ratio < TOO_SMALL:
         return 1.0
     if not any(w.startswith(f"stated {name} scales") for w in warnings):
-        warnings.append(f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide")
+        warnings.append(
+            f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide"
+        )
     return ratio if correct else 1.0

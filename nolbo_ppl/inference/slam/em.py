@@ -1,7 +1,9 @@
 """The EM between tracklets: `step` is one round of E-step (which tracklets are one object) and M-step (GTSAM).
 
-This is the working form that closes loops: relative covariances from the graph itself, inflated in the first rounds, links
-under a Cauchy kernel. It is not exact coordinate ascent on the bound of the plain EM (`nolbo_ppl.inference.slam.plain`),
+This is the working form that closes loops: relative covariances from the graph itself, inflated in the first rounds,
+links
+under a Cauchy kernel. It is not exact coordinate ascent on the bound of the plain EM
+(`nolbo_ppl.inference.slam.plain`),
 which never falls but closes no loop after drift; its log evidence is reported for each iteration with what changed.
 """
 
@@ -77,7 +79,9 @@ def make_links(state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " 
     return link_arrays(state.estimate.T_world_landmark[:, :3, :3], state.features, a, b, weight, state.link_scale)
 
 
-def groups_seen_together(first: Int[np.ndarray, " m"], last: Int[np.ndarray, " m"], limit: int = 16) -> list[np.ndarray]:
+def groups_seen_together(
+    first: Int[np.ndarray, " m"], last: Int[np.ndarray, " m"], limit: int = 16
+) -> list[np.ndarray]:
     """Tracklets in the order of their first frames, cut into groups that overlap in time one with all."""
     order = np.argsort(first, kind="stable")
     out, start = [], 0
@@ -97,7 +101,8 @@ def soft_assignment(
     """E-step: marginals of every group of tracklets seen together over the older clusters or a new landmark.
 
     Tracklets seen in one frame are different objects, so within a group the association is one-to-one; a cluster (what
-    earlier iterations hold to be one object) stands as one candidate, by its best member. Returns newer tracklets, older
+    earlier iterations hold to be one object) stands as one candidate, by its best member. Returns newer tracklets,
+    older
     ones, weights, and the log evidence above all tracklets being new.
     """
     order = np.argsort(pairs.a, kind="stable")
@@ -131,8 +136,9 @@ def soft_assignment(
 
 def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
     """The E-step of a state as links, and its log evidence."""
-    a, b, weight, evidence = soft_assignment(pairs, state.features, clusters_of(state), float(np.log(state.noise.new_rate)),
-                                             state.config)
+    a, b, weight, evidence = soft_assignment(
+        pairs, state.features, clusters_of(state), float(np.log(state.noise.new_rate)), state.config
+    )
     return make_links(state, a, b, weight), evidence
 
 
@@ -164,8 +170,16 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
         log_new = float(np.log(density(state)))
         # Closed tracklets rest until the soft E-step decides every link anew.
         fresh = pairs.select(~np.isin(pairs.a, list(state.closed)))
-        accepted = close_constellations(fresh, state.features.first, state.estimate, samples, config, inflation=inflation,
-                                        floor=state.link_scale, log_new=log_new)
+        accepted = close_constellations(
+            fresh,
+            state.features.first,
+            state.estimate,
+            samples,
+            config,
+            inflation=inflation,
+            floor=state.link_scale,
+            log_new=log_new,
+        )
         closed = dict(state.closed)
         closed.update({int(a): int(b) for c in accepted for a, b in zip(c.a, c.b)})
         closings = len(accepted)
@@ -186,13 +200,19 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
     state = replace(state, estimate=estimate, links=links, iteration=state.iteration + 1, graph_error=error)
     state = replace(state, weight=inlier_weights(state))
     info = StepInfo(
-        iteration=state.iteration, phase=phase, log_evidence=float(evidence - error), closings=closings, links=len(links),
-        strong_links=int((links.weight > config.merge_weight).sum()), change=float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
+        iteration=state.iteration,
+        phase=phase,
+        log_evidence=float(evidence - error),
+        closings=closings,
+        links=len(links),
+        strong_links=int((links.weight > config.merge_weight).sum()),
+        change=float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
         graph_error=error,
     )
     return state, info
 
 
 def density(state: SlamState) -> float:
-    """Density of landmarks in view, per m^3: five times the rate of new ones (one detection in five is of a new one)."""
+    """Density of landmarks in view, per m^3: five times the rate of new ones (one detection in five is of a new one).
+    """
     return 5.0 * state.noise.new_rate

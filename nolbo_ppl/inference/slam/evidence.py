@@ -1,6 +1,8 @@
-"""Evidence that two tracklets are one object: position gap under the graph's own relative covariance, latent, orientation.
+"""Evidence that two tracklets are one object: position gap under the graph's own relative covariance, latent,
+orientation.
 
-The covariance between any two tracklets comes from posterior samples of the linearised graph. It holds the drift between
+The covariance between any two tracklets comes from posterior samples of the linearised graph. It holds the drift
+between
 two passes of a place; the sensor's covariance alone closes no loop after drift.
 """
 
@@ -74,17 +76,22 @@ class Pairs:
         return len(self.a)
 
 
-def log_population(latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:
-    """Log density of each latent in the kernel mixture `1/(M-1) sum_c N(.; c, own + c's variance)` of all others."""
+def log_population(
+    latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"], rows: Int[np.ndarray, " r"] | None = None
+) -> Float[np.ndarray, " m"]:
+    """Log density of each latent in the kernel mixture `1/(M-1) sum_c N(.; c, own + c's variance)` of all others.
+
+    With `rows` only theirs are computed; the rest is 0.
+    """
     m, d = latent.shape
     out = np.zeros(m)
     members = np.flatnonzero(variance[:, 0] < LARGE_VARIANCE) if d else np.zeros(0, int)
     if len(members) < 2:
         return out
-    for i in members:
+    for i in members if rows is None else np.intersect1d(members, rows):
         others = members[members != i]
-        out[i] = np.logaddexp.reduce(latent_log_density(latent[i], latent[others], variance[i] + variance[others]))
-    out[members] -= np.log(len(members) - 1)
+        density = latent_log_density(latent[i], latent[others], variance[i] + variance[others])
+        out[i] = np.logaddexp.reduce(density) - np.log(len(members) - 1)
     return out
 
 
@@ -168,7 +175,12 @@ def feature_log_ratio(
 
 
 def _orientation_log_ratio(
-    estimate: Estimate, samples: PosteriorSamples, features: TrackletFeatures, config: SlamConfig, a: np.ndarray, b: np.ndarray
+    estimate: Estimate,
+    samples: PosteriorSamples,
+    features: TrackletFeatures,
+    config: SlamConfig,
+    a: np.ndarray,
+    b: np.ndarray,
 ) -> np.ndarray:
     R = estimate.T_world_landmark[:, :3, :3]
     scale = np.empty(len(a))

@@ -50,8 +50,15 @@ def association_rows(result: SlamResult) -> list[dict[str, Any]]:
     for k, j, w in zip(found.row.tolist(), found.landmark.tolist(), found.weight.tolist()):
         weights[k][f"L{j}"] = round(w, 6)
     table = result.state.problem.observations
-    return [{"id": table.id[k], "landmarks": dict(sorted(weights[k].items(), key=lambda item: -item[1])),
-             "new": round(float(found.new[k]), 6), "background": round(float(found.background[k]), 6)} for k in range(len(table))]
+    return [
+        {
+            "id": table.id[k],
+            "landmarks": dict(sorted(weights[k].items(), key=lambda item: -item[1])),
+            "new": round(float(found.new[k]), 6),
+            "background": round(float(found.background[k]), 6),
+        }
+        for k in range(len(table))
+    ]
 
 
 def loop_pair_count(result: SlamResult, minimum_gap: int = 50) -> int:
@@ -89,12 +96,19 @@ def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, An
     """What `summary.json` holds."""
     state = result.state
     out: dict[str, Any] = {
-        "frames": len(state.problem), "observations": len(state.problem.observations), "landmarks": len(state.static),
-        "tracklets": len(state.tracklets), "moving_tracklets": int(state.tracklets.moving.sum()),
-        "loop_pairs": loop_pair_count(result), "associations_exact": result.associations.exact,
-        "iterations": [asdict(info) for info in result.infos], "final_log_evidence": float(np.sum(result.associations.log_evidence)),
-        "noise": {k: float(v) for k, v in state.noise.report.items()}, "warnings": list(state.noise.warnings),
-        "seconds": result.seconds, "versions": library_versions(),
+        "frames": len(state.problem),
+        "observations": len(state.problem.observations),
+        "landmarks": len(state.static),
+        "tracklets": len(state.tracklets),
+        "moving_tracklets": int(state.tracklets.moving.sum()),
+        "loop_pairs": loop_pair_count(result),
+        "associations_exact": result.associations.exact,
+        "iterations": [asdict(info) for info in result.infos],
+        "final_log_evidence": float(np.sum(result.associations.log_evidence)),
+        "noise": {k: float(v) for k, v in state.noise.report.items()},
+        "warnings": list(state.noise.warnings),
+        "seconds": result.seconds,
+        "versions": library_versions(),
         "configuration": {k: dict(v) if k == "category_symmetry" else v for k, v in asdict(state.config).items()},
     }
     if truth is not None:
@@ -104,7 +118,11 @@ def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, An
 
 
 def write_result(
-    out: str | PathLike[str], result: SlamResult, odometry: Trajectory, truth: np.ndarray | None = None, picture: bool = True
+    out: str | PathLike[str],
+    result: SlamResult,
+    odometry: Trajectory,
+    truth: np.ndarray | None = None,
+    picture: bool = True,
 ) -> dict[str, Any]:
     """Write every file into `out`, each atomically, the summary last; returns the summary.
 
@@ -126,9 +144,15 @@ def write_result(
         landmarks = result.landmarks
         positions = np.array([x.T_world_object[:3, 3] for x in landmarks]).reshape(-1, 3)
         spreads = np.array([x.position_covariance for x in landmarks]).reshape(-1, 3, 3)
-        draw_map(out / "map.png", odometry.T_world_camera, result.T_world_camera,
-                 truth=None if truth is None else align(truth, result.T_world_camera), landmarks=positions, covariance=spreads,
-                 names=[x.name for x in landmarks])
+        draw_map(
+            out / "map.png",
+            odometry.T_world_camera,
+            result.T_world_camera,
+            truth=None if truth is None else align(truth, result.T_world_camera),
+            landmarks=positions,
+            covariance=spreads,
+            names=[x.name for x in landmarks],
+        )
     report = summary(result, truth)
     write_json(out / "summary.json", report)
     return report

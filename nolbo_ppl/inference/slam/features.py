@@ -1,6 +1,7 @@
 """What an object looks like, as evidence: latents and categories against the population they are drawn from.
 
-A match of latents is worth only as much as it is rare: its likelihood is divided by the density of the population, which
+A match of latents is worth only as much as it is rare: its likelihood is divided by the density of the population,
+which
 is estimated from the objects themselves. Twenty identical cars then give no evidence at all, and no match is ever worth
 more than the log of the number of objects.
 """
@@ -80,7 +81,9 @@ def fit_prior(table: ObservationTable, config: SlamConfig) -> FeaturePrior:
 def category_index(table: ObservationTable, prior: FeaturePrior) -> Int[np.ndarray, " n"]:
     """Index of each detection's category, -1 where it has none or one the prior does not know."""
     lookup = {name: i for i, name in enumerate(prior.categories)}
-    return np.array([lookup.get(c, -1) if c is not None else -1 for c in table.category], dtype=np.int64).reshape(len(table))
+    return np.array([lookup.get(c, -1) if c is not None else -1 for c in table.category], dtype=np.int64).reshape(
+        len(table)
+    )
 
 
 def detection_features(
@@ -105,8 +108,10 @@ def weighted_latents(
     latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, " n"],
     weight: Float[np.ndarray, " n"], groups: int,
 ) -> tuple[Float[np.ndarray, "g d"], Float[np.ndarray, "g d"]]:
-    """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu, corrected:
-    positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get LARGE_VARIANCE.
+    """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu,
+    corrected:
+    positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get
+    LARGE_VARIANCE.
     """
     d = latent.shape[1]
     precision, total = np.zeros((groups, d)), np.zeros((groups, d))
@@ -120,7 +125,10 @@ def weighted_latents(
 
 
 def latent_population_log_ratio(
-    latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"], a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
+    latent: Float[np.ndarray, "m d"],
+    variance: Float[np.ndarray, "m d"],
+    a: Int[np.ndarray, " p"],
+    b: Int[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
     """Log ratio of tracklet a's latent given that of b to its density in the population of all other tracklets.
 

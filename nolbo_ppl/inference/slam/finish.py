@@ -1,4 +1,6 @@
-"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, every detection associated anew."""
+"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, every detection associated
+anew.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,7 @@ import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl.inference.slam.calibration import calibrate
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.em import make_links
 from nolbo_ppl.inference.slam.evidence import candidate_pairs, posterior_samples
@@ -44,7 +47,9 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
     landmark = cluster[state.landmark]
     moved = replace(state.problem, odometry=state.estimate.T_world_camera)
     estimate = first_estimate(moved, state.noise, state.config, state.rows, landmark, count)
-    features = tracklet_features(state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count)
+    features = tracklet_features(
+        state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count
+    )
     return replace(state, landmark=landmark, static=np.arange(count), features=features, links=Links.none(), closed={},
                    estimate=Estimate(state.estimate.T_world_camera, estimate.T_world_landmark))
 
@@ -67,7 +72,9 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
     samples = posterior_samples(linearise_state(state), state.estimate, state.config.samples, rng)
     frames = frames_of_landmarks(state)
     spans = replace(state.features, first=np.arange(len(frames)), last=np.arange(len(frames)))  # every pair once
-    pairs = candidate_pairs(state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale)
+    pairs = candidate_pairs(
+        state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale
+    )
     value = pairs.log_position + pairs.log_feature - np.log(state.noise.new_rate)
     apart = np.array([frames[i].isdisjoint(frames[j]) for i, j in zip(pairs.a, pairs.b)], dtype=bool)
     good = np.flatnonzero((value > MERGE_LOG_ODDS) & apart)
@@ -105,7 +112,9 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
     count = int(keep.sum())
     state = replace(state, rows=state.rows[rows], landmark=landmark, weight=state.weight[rows], static=np.arange(count),
                     estimate=Estimate(state.estimate.T_world_camera, state.estimate.T_world_landmark[keep]))
-    features = tracklet_features(state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count)
+    features = tracklet_features(
+        state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count
+    )
     return replace(state, features=features)
 
 
@@ -114,8 +123,10 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     rng = np.random.default_rng([state.config.seed, 104729])
     links = surviving_links(state)
     cluster = join(links, frames_of_landmarks(state), state.config.merge_weight)
-    state = solve_clean(relabel(state, cluster))
-    state = merge_duplicates(state, rng)
+    state = solve_clean(relabel(state, cluster), repeats=2, tolerance=1e-5)
+    # Several passes of one object show what one track cannot: how far the detector errs from view to view.
+    state = calibrate(state)
+    state = merge_duplicates(solve_clean(state, repeats=2, tolerance=1e-5), rng)
     state = solve_clean(state)
     state, _ = reassociate(state, rng)
     state = drop_empty(state, 0.5)

@@ -1,7 +1,8 @@
 """The factor graph in GTSAM: poses, landmarks, odometry, observations with their weights, links between landmarks.
 
 Every landmark is a Pose3, also where no orientation is observed: a `BetweenFactorPose3` then carries a rotation part so
-loose (10 rad) that it says nothing. It converges in 5 iterations where points with bearing and range take 16. Weights sit
+loose (10 rad) that it says nothing. It converges in 5 iterations where points with bearing and range take 16. Weights
+sit
 in the noise models (scale / sqrt(w)) and are frozen while the graph is solved.
 """
 
@@ -116,14 +117,18 @@ def resolve_observations(
         error = so3_log(np.swapaxes(predicted[o], 1, 2) @ observed[o])
         error[symmetry[o] == 0, 2] = 0.0
         log_mode = -0.5 * np.sum(error**2, axis=1) / scale[o] ** 2 - 1.5 * np.log(2 * np.pi * scale[o] ** 2)
-        lost = log_mode + np.log1p(-config.orientation_outlier) < np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY
+        lost = (
+            log_mode + np.log1p(-config.orientation_outlier) < np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY
+        )
         oriented[o[lost]] = False
         observed[o[lost]] = predicted[o[lost]]
     covariance = np.zeros((len(rows), 6, 6))
     angular = np.where(oriented, scale * np.sqrt(noise.rotation_factor), LOOSE_ROTATION)
     covariance[:, [0, 1, 2], [0, 1, 2]] = (angular**2)[:, None]
     covariance[oriented & (symmetry == 0), 2, 2] = LOOSE_ROTATION**2
-    covariance[:, 3:, 3:] = noise.position_factor * (np.swapaxes(observed, 1, 2) @ noise.position_covariance[rows] @ observed)
+    covariance[:, 3:, 3:] = noise.position_factor * (
+        np.swapaxes(observed, 1, 2) @ noise.position_covariance[rows] @ observed
+    )
     return ObservationFactors(frame, landmark, make_pose(observed, table.position[rows]), covariance, weight)
 
 
@@ -140,7 +145,9 @@ def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.Nonlinear
     return graph
 
 
-def add_observation_factors(graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3) -> None:
+def add_observation_factors(
+    graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3
+) -> None:
     """One factor a detection, its covariance divided by its weight; weights below `minimum` are left out."""
     covariance = factors.covariance / np.maximum(factors.weight, 1e-12)[:, None, None]
     # One batched factorisation here, so that GTSAM checks nothing and prints nothing.
@@ -152,7 +159,10 @@ def add_observation_factors(graph: gtsam.NonlinearFactorGraph, factors: Observat
 
 
 def add_landmark_priors(
-    graph: gtsam.NonlinearFactorGraph, T_world_landmark: Float[np.ndarray, "m 4 4"], typical_range: float, first: int = 0
+    graph: gtsam.NonlinearFactorGraph,
+    T_world_landmark: Float[np.ndarray, "m 4 4"],
+    typical_range: float,
+    first: int = 0,
 ) -> None:
     """Weak prior on each landmark (numbered from `first`), so that no system is ever indeterminate."""
     sigmas = np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [PRIOR_POSITION_RATIO * max(typical_range, 1e-3)] * 3)
@@ -192,7 +202,9 @@ def from_values(values: gtsam.Values, poses: int, landmarks: int) -> Estimate:
 def named_error(error: RuntimeError) -> GraphError:
     """Turn GTSAM's complaint into one that names the variable."""
     text = " ".join(str(error).split())
-    return GraphError(f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)")
+    return GraphError(
+        f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)"
+    )
 
 
 def optimise(
@@ -235,7 +247,9 @@ class Linearisation:
     factor: scipy.sparse.linalg.SuperLU
     """Factorisation of its normal matrix."""
 
-    def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
+    def samples(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
         """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""
         noise = rng.standard_normal((self.jacobian.shape[0], count))
         delta = self.factor.solve(self.jacobian.T @ noise).reshape(-1, 6, count)

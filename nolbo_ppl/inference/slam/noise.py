@@ -137,7 +137,8 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
 def odometry_scales(
     length: Float[np.ndarray, " n"], config: SlamConfig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances."""
+    """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances.
+    """
     typical = float(np.sqrt(np.mean(length**2))) if len(length) else 1.0
     typical = max(typical, 1e-3)
     rotation = DEFAULT_ROTATION_STEP if config.odometry_rotation_scale is None else config.odometry_rotation_scale
@@ -209,7 +210,9 @@ def _rotation_scale(
     default = config.rotation_scale
     if both.sum() >= 5:
         i, j = pairs.first[both], pairs.second[both]
-        carried = relative(problem.odometry[table.frame[j]], problem.odometry[table.frame[i]])[:, :3, :3] @ table.rotation[i]
+        carried = (
+            relative(problem.odometry[table.frame[j]], problem.odometry[table.frame[i]])[:, :3, :3] @ table.rotation[i]
+        )
         symmetry = resolved_symmetry(table, config)
         observed = nearest_mode_rotation(carried, table.rotation[j], symmetry[j])
         error = so3_log(np.swapaxes(carried, 1, 2) @ observed)

@@ -1,4 +1,6 @@
-"""The E-step of single detections against a map: exact marginals of every frame, with new-landmark and background odds."""
+"""The E-step of single detections against a map: exact marginals of every frame, with new-landmark and background
+odds.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,9 @@ def associate_detections(
     both = np.flatnonzero(table.has_rotation[rows] & features.oriented[landmarks])
     if len(both):
         k, j = rows[both], landmarks[both]
-        predicted = np.swapaxes(estimate.T_world_camera[table.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
+        predicted = (
+            np.swapaxes(estimate.T_world_camera[table.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
+        )
         scale = np.sqrt(noise.rotation_scale[k] ** 2 + 0.02**2)
         value[both] += orientation_log_density(predicted, table.rotation[k], scale, resolved_symmetry(table, config)[k],
                                                config) - UNIFORM_LOG_DENSITY
@@ -108,8 +112,15 @@ def _gated(
 
 
 def _marginals(
-    frame: np.ndarray, rows: np.ndarray, landmarks: np.ndarray, value: np.ndarray, log_null: np.ndarray, log_new: np.ndarray,
-    n: int, m: int, config: SlamConfig,
+    frame: np.ndarray,
+    rows: np.ndarray,
+    landmarks: np.ndarray,
+    value: np.ndarray,
+    log_null: np.ndarray,
+    log_new: np.ndarray,
+    n: int,
+    m: int,
+    config: SlamConfig,
 ) -> Associations:
     order = np.argsort(frame, kind="stable")
     frames, starts = np.unique(frame[order], return_index=True)
@@ -118,7 +129,9 @@ def _marginals(
     sorted_rows = rows[by_row]
     problems, columns_of = [], []
     for group in groups:
-        spans = [by_row[np.searchsorted(sorted_rows, k, "left"):np.searchsorted(sorted_rows, k, "right")] for k in group]
+        spans = [
+            by_row[np.searchsorted(sorted_rows, k, "left") : np.searchsorted(sorted_rows, k, "right")] for k in group
+        ]
         entries = np.concatenate(spans)
         columns, column = np.unique(landmarks[entries], return_inverse=True)
         log_likelihood = np.full((len(group), len(columns)), -np.inf)
@@ -137,7 +150,11 @@ def _marginals(
     new = null * np.exp(log_new - log_null)
     stack = (lambda x, t: np.concatenate(x).astype(t)) if out_row else (lambda x, t: np.zeros(0, t))
     return Associations(
-        row=stack(out_row, np.int64), landmark=stack(out_landmark, np.int64), weight=stack(out_weight, np.float64), new=new,
-        background=np.maximum(null - new, 0.0), log_evidence=np.array([r.log_evidence for r in marginals]),
+        row=stack(out_row, np.int64),
+        landmark=stack(out_landmark, np.int64),
+        weight=stack(out_weight, np.float64),
+        new=new,
+        background=np.maximum(null - new, 0.0),
+        log_evidence=np.array([r.log_evidence for r in marginals]),
         exact=all(r.exact for r in marginals),
     )

@@ -21,7 +21,7 @@ from nolbo_ppl.inference.slam.graph import (
 from nolbo_ppl.inference.slam.noise import TOO_SMALL
 from nolbo_ppl.inference.slam.state_types import SlamState
 
-WINDOW = 120
+WINDOW = 200
 """Frames the evidence is taken from: where most detections are."""
 STEPS = (4.0, 2.0)
 """Factors tried on each scale, coarse first."""
@@ -52,11 +52,16 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
     names, landmark = np.unique(state.landmark[inside], return_inverse=True)
     table = state.problem.observations.select(state.rows[inside])
     table = replace(table, frame=table.frame - first)
+    # The caution in the factors would pass errors of the odometry for errors of the detector.
     noise = replace(
-        state.noise, rotation_step=state.noise.rotation_step[first : first + length - 1],
+        state.noise,
+        position_factor=1.0,
+        rotation_factor=1.0,
+        rotation_step=state.noise.rotation_step[first : first + length - 1],
         translation_step=state.noise.translation_step[first : first + length - 1],
         position_covariance=state.noise.position_covariance[state.rows[inside]],
-        rotation_scale=state.noise.rotation_scale[state.rows[inside]], latent_scale=state.noise.latent_scale[state.rows[inside]],
+        rotation_scale=state.noise.rotation_scale[state.rows[inside]],
+        latent_scale=state.noise.latent_scale[state.rows[inside]],
     )
     problem = SlamProblem(state.problem.odometry[first : first + length], table)
     estimate = Estimate(state.estimate.T_world_camera[first : first + length], state.estimate.T_world_landmark[names])
@@ -80,7 +85,9 @@ def log_evidence(window: SlamState, rotation: float, translation: float) -> floa
 
 
 def odometry_by_evidence(state: SlamState) -> SlamState:
-    """Scale factors of the odometry (where not stated) that the tracked objects make most probable, by coordinate search."""
+    """Scale factors of the odometry (where not stated) that the tracked objects make most probable, by coordinate
+    search.
+    """
     stated_rotation, stated_translation = stated_scales(state.config)
     free = [not stated_rotation, not stated_translation]
     window = densest_window(state) if any(free) else state
@@ -135,7 +142,8 @@ def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[flo
 def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState:
     """One EM update of the odometry scales: `sigma^2 <- E[r^2]` over the posterior.
 
-    Stated scales stay unless they are too small by more than a third (reported, and raised with `correct_scales`); scales
+    Stated scales stay unless they are too small by more than a third (reported, and raised with `correct_scales`);
+    scales
     nobody stated only grow: a posterior that knows little of a step would let them creep.
     """
     if len(state.problem) < 3 or not len(state.rows):

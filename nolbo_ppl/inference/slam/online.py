@@ -1,7 +1,8 @@
 """Online SLAM: a keyframe at a time on iSAM2, loops closed as tracks end, the batch map at the end.
 
 Each keyframe costs one association of its detections with live tracks, one iSAM2 update, and the read-out of one pose.
-Every few ended tracks one window of them is matched to all older ones (constellation first, the soft E-step for the rest)
+Every few ended tracks one window of them is matched to all older ones (constellation first, the soft E-step for the
+rest)
 under the covariance of a coarse drift graph. `finish` hands tracks and closings to the batch EM for the final map.
 """
 
@@ -16,18 +17,15 @@ from jaxtyping import Float
 from nolbo_ppl.data.observations import ObservationTable, concatenate
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
-from nolbo_ppl.inference.slam.clusters import join
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
-from nolbo_ppl.inference.slam.constellation import find_closing
 from nolbo_ppl.inference.slam.drift import DriftGraph
-from nolbo_ppl.inference.slam.em import link_arrays, soft_assignment
-from nolbo_ppl.inference.slam.evidence import PosteriorSamples, TrackletFeatures, candidate_pairs, log_population
+from nolbo_ppl.inference.slam.em import link_arrays
+from nolbo_ppl.inference.slam.evidence import TrackletFeatures
 from nolbo_ppl.inference.slam.features import detection_features, fit_prior, fuse_latent
 from nolbo_ppl.inference.slam.finish import finish
 from nolbo_ppl.inference.slam.graph import (
     GAUGE_SCALE,
     Estimate,
-    Links,
     add_landmark_priors,
     add_observation_factors,
     landmark_key,
@@ -36,41 +34,13 @@ from nolbo_ppl.inference.slam.graph import (
     resolve_observations,
 )
 from nolbo_ppl.inference.slam.noise import estimate_noise
+from nolbo_ppl.inference.slam.online_loops import Track, find_links, track_samples
 from nolbo_ppl.inference.slam.orientation import resolved_symmetry
 from nolbo_ppl.inference.slam.result import SlamResult
 from nolbo_ppl.inference.slam.solve import iterate
 from nolbo_ppl.inference.slam.state import init, init_from_tracklets
 from nolbo_ppl.inference.slam.state_types import link_scale
 from nolbo_ppl.inference.slam.tracklets import Tracker, summarise_tracks
-
-SURE = 0.9
-"""Soft links above this weight are closed online; the rest waits for `finish`."""
-
-
-@dataclass
-class Track:
-    """A track as the online system keeps it."""
-
-    rows: list[int]
-    """Its detections."""
-    landmark: int
-    """Landmark in the graph, -1 while it is too short."""
-    latent: Float[np.ndarray, " d"]
-    """Fused latent."""
-    latent_variance: Float[np.ndarray, " d"]
-    """Its variance."""
-    category: int
-    """Category of the first detection."""
-    symmetry: int
-    """Its symmetry."""
-    oriented: bool
-    """Whether it is oriented."""
-    first: int
-    """First frame."""
-    last: int
-    """Last frame."""
-    R: Float[np.ndarray, "3 3"]
-    """Orientation in the odometry's world frame."""
 
 
 @dataclass(frozen=True)
@@ -180,12 +150,19 @@ class ObjectSlam:
                 position = width * max(lateral, radial)
                 growth = width * max(report["position_lateral_ratio"], report["position_radial_ratio"])
             self.config = replace(
-                config, odometry_rotation_scale=float(np.median(reference.rotation_step)), odometry_translation_ratio=ratio,
-                odometry_translation_scale=constant, position_scale=position, position_ratio=growth,
-                rotation_scale=config.rotation_scale or float(np.median(reference.rotation_scale)) if len(
-                    reference.rotation_scale) else config.rotation_scale,
+                config,
+                odometry_rotation_scale=float(np.median(reference.rotation_step)),
+                odometry_translation_ratio=ratio,
+                odometry_translation_scale=constant,
+                position_scale=position,
+                position_ratio=growth,
+                rotation_scale=config.rotation_scale or float(np.median(reference.rotation_scale))
+                if len(reference.rotation_scale)
+                else config.rotation_scale,
                 latent_scale=config.latent_scale or (report.get("latent_scale") if "latent_scale" in report else None),
-                new_rate=reference.new_rate, clutter_rate=reference.clutter_rate)
+                new_rate=reference.new_rate,
+                clutter_rate=reference.clutter_rate,
+            )
             self.factors = (reference.position_factor, reference.rotation_factor)
         else:
             self.prior = fit_prior(table, self.config)
@@ -223,7 +200,13 @@ class ObjectSlam:
         return rotation, translation
 
     def _track(
-        self, table: ObservationTable, noise: NoiseModel, odometry: np.ndarray, frame: int, rotation: float, translation: float
+        self,
+        table: ObservationTable,
+        noise: NoiseModel,
+        odometry: np.ndarray,
+        frame: int,
+        rotation: float,
+        translation: float,
     ) -> tuple[np.ndarray, np.ndarray]:
         tracker = self.tracker
         assert tracker is not None
@@ -234,13 +217,26 @@ class ObjectSlam:
         R = odometry[:3, :3]
         latent, variance, category = detection_features(table, noise, self.prior)
         return tracker.associate(
-            transform(odometry, table.position), R @ noise.position_covariance @ R.T,
+            transform(odometry, table.position),
+            R @ noise.position_covariance @ R.T,
             np.where(table.has_rotation[:, None, None], R @ np.nan_to_num(table.rotation), np.eye(3)),
-            np.where(table.has_rotation, noise.rotation_scale, np.nan), resolved_symmetry(table, self.config), latent, variance,
-            category, np.clip(table.objectness, *self.config.objectness_limits), frame)
+            np.where(table.has_rotation, noise.rotation_scale, np.nan),
+            resolved_symmetry(table, self.config),
+            latent,
+            variance,
+            category,
+            np.clip(table.objectness, *self.config.objectness_limits),
+            frame,
+        )
 
     def _remember(
-        self, table: ObservationTable, noise: NoiseModel, assigned: np.ndarray, start: int, odometry: np.ndarray, frame: int
+        self,
+        table: ObservationTable,
+        noise: NoiseModel,
+        assigned: np.ndarray,
+        start: int,
+        odometry: np.ndarray,
+        frame: int,
     ) -> None:
         """Fuse features of each detection into its track."""
         latent, variance, category = detection_features(table, noise, self.prior)
@@ -257,12 +253,16 @@ class ObjectSlam:
             track = self.tracks[number]
             track.rows.append(start + i)
             track.last = frame
-            track.latent, track.latent_variance = fuse_latent(track.latent, track.latent_variance, latent[i], variance[i])
+            track.latent, track.latent_variance = fuse_latent(
+                track.latent, track.latent_variance, latent[i], variance[i]
+            )
 
     def _add_factors(
         self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, odometry: np.ndarray, frame: int
     ) -> None:
-        """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
+        """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then
+        added.
+        """
         for i, number in enumerate(assigned.tolist()):
             if number < 0:
                 continue
@@ -293,8 +293,9 @@ class ObjectSlam:
         self, problem: SlamProblem, noise: NoiseModel, i: int, frame: int, T_world_camera: np.ndarray, landmark: int
     ) -> None:
         estimate = Estimate(T_world_camera[None], self._landmark(landmark)[None])
-        factors = resolve_observations(problem, noise, self.config, estimate, np.array([i]), np.zeros(1, dtype=np.int64),
-                                       np.ones(1))
+        factors = resolve_observations(
+            problem, noise, self.config, estimate, np.array([i]), np.zeros(1, dtype=np.int64), np.ones(1)
+        )
         add_observation_factors(self.graph, replace(factors, frame=np.array([frame]), landmark=np.array([landmark])))
 
     def _landmark(self, number: int) -> np.ndarray:
@@ -320,72 +321,38 @@ class ObjectSlam:
         if len(ended) < half:
             return 0
         self.fresh = [j for j in self.fresh if j not in set(ended)]
-        m = len(self.track_of_landmark)
-        window = sorted(set(ended) | {j for j, _ in zip(range(min(ended) - 1, -1, -1), range(half))})
+        window = np.unique([*ended, *range(max(min(ended) - half, 0), min(ended))])
         tracks = [self.tracks[number] for number in self.track_of_landmark]
-        features = TrackletFeatures(
-            latent=np.array([t.latent for t in tracks]), latent_variance=np.array([t.latent_variance for t in tracks]),
-            log_population=np.zeros(m), category=np.array([t.category for t in tracks]),
-            symmetry=np.array([t.symmetry for t in tracks]), oriented=np.array([t.oriented for t in tracks]),
-            first=np.array([t.first if j in set(window) else -1 for j, t in enumerate(tracks)]),
-            last=np.array([t.last for t in tracks]))
-        features = replace(features, log_population=log_population(features.latent, features.latent_variance))
-        poses = np.array([self._landmark(j) for j in range(m)])
-        estimate = Estimate(self.T_world_camera[None], poses)
+        poses = np.array([self._landmark(j) for j in range(len(tracks))])
         rng = np.random.default_rng([self.config.seed, frame])
-        samples = self._samples(poses, tracks, noise, rng)
-        floor = link_scale(noise) if len(noise.position_covariance) else 0.1
-        pairs = candidate_pairs(estimate, samples, features, self.prior, self.config, inflation=1.0, floor=floor)
-        linked = {a for a, _ in self.links}
-        pairs = pairs.select(np.array([int(a) not in linked for a in pairs.a], dtype=bool))
-        log_new = float(np.log(5.0 * noise.new_rate))
-        outside = pairs.select(~np.isin(pairs.b, window))
-        closing = find_closing(outside, estimate, samples, self.config, inflation=1.0, floor=floor, log_new=log_new)
-        found: list[tuple[int, int]] = []
-        if closing and closing.log_odds > self.config.constellation_log_odds and (
-                closing.margin > self.config.constellation_log_odds / 2):
-            found += list(zip(closing.a.tolist(), closing.b.tolist()))
-        taken = {a for a, _ in found}
-        rest = pairs.select(np.array([int(a) not in taken for a in pairs.a], dtype=bool))
-        frames = [frozenset(range(t.first, t.last + 1)) for t in tracks]
-        known = np.array(self.links, dtype=np.int64).reshape(-1, 2)
-        cluster = join(Links(known[:, 0], known[:, 1], np.ones(len(known)), np.zeros((0, 4, 4)), np.zeros((0, 2))), frames, 0.5)
-        a, b, weight, _ = soft_assignment(rest, features, cluster, float(np.log(noise.new_rate)), self.config)
-        found += [(int(i), int(j)) for i, j, w in zip(a, b, weight) if w > SURE]
+        samples = track_samples(poses, tracks, noise, self.drift, self.config.samples, rng)
+        floor = link_scale(noise)
+        found, features = find_links(window, tracks, Estimate(self.T_world_camera[None], poses), samples, self.prior,
+                                     self.config, self.links, floor=floor, new_rate=noise.new_rate)
         if found:
             self._link(found, poses, features, tracks, floor)
         return len(found)
 
     def _link(
-        self, found: list[tuple[int, int]], poses: np.ndarray, features: TrackletFeatures, tracks: list[Track], scale: float
+        self,
+        found: list[tuple[int, int]],
+        poses: np.ndarray,
+        features: TrackletFeatures,
+        tracks: list[Track],
+        scale: float,
     ) -> None:
         pairs = np.array(found, dtype=np.int64)
         links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
         for k, (i, j) in enumerate(found):
             model = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(links.scale[k], 3))
-            self.graph.add(gtsam.BetweenFactorPose3(landmark_key(i), landmark_key(j), gtsam.Pose3(links.T_a_b[k]), model))
+            self.graph.add(
+                gtsam.BetweenFactorPose3(landmark_key(i), landmark_key(j), gtsam.Pose3(links.T_a_b[k]), model)
+            )
             self.drift.close((tracks[i].first + tracks[i].last) // 2, (tracks[j].first + tracks[j].last) // 2,
                              poses[j, :3, 3], 2 * scale)
         self.links += found
         self._commit()
         self.isam.update()
-
-    def _samples(
-        self, poses: np.ndarray, tracks: list[Track], noise: NoiseModel, rng: np.random.Generator
-    ) -> PosteriorSamples:
-        """Samples of all landmarks: the drift of their node, and the noise of their own detections."""
-        nodes = self.drift.samples(self.config.samples, rng)
-        middle = np.array([(t.first + t.last) // 2 for t in tracks])
-        error = nodes[self.drift.node(middle)]
-        position = poses[:, :3, 3]
-        moved = np.cross(error[:, :3], position[:, :, None], axis=1) + error[:, 3:]
-        own = np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3) if len(
-            noise.position_covariance) else 0.1
-        count = np.array([len(t.rows) for t in tracks])
-        spread = own / np.sqrt(count)
-        angle = (float(np.median(noise.rotation_scale)) if len(noise.rotation_scale) else 0.1) / np.sqrt(count)
-        return PosteriorSamples(moved + spread[:, None, None] * rng.standard_normal(moved.shape),
-                                error[:, :3] + angle[:, None, None] * rng.standard_normal(moved.shape))
 
     # -- answers ------------------------------------------------------------------------------------------------------
 
@@ -405,7 +372,9 @@ class ObjectSlam:
         problem = SlamProblem(np.array(self.odometry), concatenate(self.tables))
         noise = estimate_noise(problem, self.config)
         prior = fit_prior(problem.observations, self.config)
-        tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
+        tracklets = summarise_tracks(
+            problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights)
+        )
         state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
         state, infos = iterate(state)
         state, associations = finish(state)

@@ -17,7 +17,10 @@ from nolbo_ppl.inference.slam.tracklets import Tracklets
 
 
 def solve_with_associations(
-    problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig | None = None, noise: NoiseModel | None = None,
+    problem: SlamProblem,
+    object_of: Int[np.ndarray, " k"],
+    config: SlamConfig | None = None,
+    noise: NoiseModel | None = None,
 ) -> SlamState:
     """Solve the graph with given associations (-1: leave out), all weights one, no kernels.
 
@@ -39,9 +42,18 @@ def solve_with_associations(
     tracklets = Tracklets(full, (full >= 0).astype(float), features.first, features.last,
                           np.bincount(landmark, minlength=count), np.zeros(count, bool))
     state = SlamState(
-        problem=problem, config=config, noise=noise, prior=prior, tracklets=tracklets, static=np.arange(count), rows=rows,
-        landmark=landmark, weight=weight, features=features,
-        estimate=first_estimate(problem, noise, config, rows, landmark, count), links=Links.none(),
+        problem=problem,
+        config=config,
+        noise=noise,
+        prior=prior,
+        tracklets=tracklets,
+        static=np.arange(count),
+        rows=rows,
+        landmark=landmark,
+        weight=weight,
+        features=features,
+        estimate=first_estimate(problem, noise, config, rows, landmark, count),
+        links=Links.none(),
         typical_range=float(np.median(np.linalg.norm(problem.observations.position, axis=1))) if len(full) else 1.0,
     )
     estimate, _, error = optimise(base_graph(state), state.estimate, iterations=100, relative_tolerance=1e-8)

@@ -1,9 +1,12 @@
 """The plain EM of the paper, corrected: a fixed set of landmarks, sensor covariances, and a bound that never falls.
 
-Maximises the log posterior `sum_t log evidence_t(X, L, mu) + log p(odometry | X) + log p(L)` over poses X, landmark poses
+Maximises the log posterior `sum_t log evidence_t(X, L, mu) + log p(odometry | X) + log p(L)` over poses X, landmark
+poses
 L and latents mu, where a frame's evidence sums over all one-to-one associations of its detections with landmarks, a new
-object or background, and over the modes of every orientation. E-step: exact marginals. M-step: GTSAM with frozen weights
-`w_kj * (share of the mode)` inside the noise models (NOLBO eq. EM_maximization without its second sum over associations,
+object or background, and over the modes of every orientation. E-step: exact marginals. M-step: GTSAM with frozen
+weights
+`w_kj * (share of the mode)` inside the noise models (NOLBO eq. EM_maximization without its second sum over
+associations,
 which counts every detection several times), then the normalised latent update. Either step alone can only raise the
 posterior. It closes no loop after drift, since its covariances hold the sensor alone: use `solve` for that.
 """
@@ -175,13 +178,22 @@ def e_step(state: PlainState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarra
     latent, variance, _ = detection_features(table, noise, fit_prior(table, config))
     if table.latent_dim:
         known = variance[:, 0] < LARGE_VARIANCE
-        log_likelihood[known] += latent_log_density(latent[known][:, None], state.latent[None], variance[known][:, None])
+        log_likelihood[known] += latent_log_density(
+            latent[known][:, None], state.latent[None], variance[known][:, None]
+        )
     objectness = np.clip(table.objectness, *config.objectness_limits)
     log_new = np.log(objectness) + np.log(noise.new_rate)
     if table.latent_dim:
         # A new object's latent comes from the population; background shows the same, so that the terms compare.
-        population = np.where(known, latent_log_density(latent, latent[known].mean(axis=0) if known.any() else 0.0,
-                                                        variance + latent[known].var(axis=0) if known.any() else 1.0), 0.0)
+        population = np.where(
+            known,
+            latent_log_density(
+                latent,
+                latent[known].mean(axis=0) if known.any() else 0.0,
+                variance + latent[known].var(axis=0) if known.any() else 1.0,
+            ),
+            0.0,
+        )
     else:
         population = np.zeros(n)
     log_null = np.logaddexp(log_new, np.log1p(-objectness) + np.log(noise.clutter_rate)) + population
@@ -215,7 +227,9 @@ def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
     mode_weights, weights, evidence = e_step(state)
     prior_error = frozen_graph(state, None).error(to_values(state.estimate))
     info = PlainInfo(state.iteration + 1, evidence - prior_error, evidence, weights.sum(axis=0))
-    estimate, _, _ = optimise(frozen_graph(state, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10)
+    estimate, _, _ = optimise(
+        frozen_graph(state, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10
+    )
     latent = state.latent
     table = state.problem.observations
     if table.latent_dim:
@@ -227,7 +241,9 @@ def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
     return replace(state, estimate=estimate, latent=latent, iteration=state.iteration + 1), info
 
 
-def plain_solve(state: PlainState, iterations: int = 20, tolerance: float = 1e-4) -> tuple[PlainState, tuple[PlainInfo, ...]]:
+def plain_solve(
+    state: PlainState, iterations: int = 20, tolerance: float = 1e-4
+) -> tuple[PlainState, tuple[PlainInfo, ...]]:
     """Iterate until the bound rises by less than `tolerance` nats."""
     infos: list[PlainInfo] = []
     for _ in range(iterations):

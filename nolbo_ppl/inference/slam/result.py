@@ -105,14 +105,25 @@ class SlamResult:
         for j, T in enumerate(poses):
             R = T[:3, :3]
             known = state.features.latent.shape[1] > 0 and state.features.latent_variance[j, 0] < LARGE_VARIANCE
-            out.append(Landmark(
-                index=j, T_world_object=T, covariance=covariance[j], position_covariance=R @ covariance[j, 3:, 3:] @ R.T,
-                oriented=bool(state.features.oriented[j]), existence=float(existence[j]),
-                class_posterior={c: float(p) for c, p in zip(state.prior.categories, classes[j])} if len(classes[j]) else {},
-                latent=state.features.latent[j] if known else None,
-                latent_variance=state.features.latent_variance[j] if known else None, size=sizes[j],
-                detections=float(total[j]), first_frame=int(state.features.first[j]), last_frame=int(state.features.last[j]),
-            ))
+            out.append(
+                Landmark(
+                    index=j,
+                    T_world_object=T,
+                    covariance=covariance[j],
+                    position_covariance=R @ covariance[j, 3:, 3:] @ R.T,
+                    oriented=bool(state.features.oriented[j]),
+                    existence=float(existence[j]),
+                    class_posterior={c: float(p) for c, p in zip(state.prior.categories, classes[j])}
+                    if len(classes[j])
+                    else {},
+                    latent=state.features.latent[j] if known else None,
+                    latent_variance=state.features.latent_variance[j] if known else None,
+                    size=sizes[j],
+                    detections=float(total[j]),
+                    first_frame=int(state.features.first[j]),
+                    last_frame=int(state.features.last[j]),
+                )
+            )
         return tuple(out)
 
     def _sizes(self) -> list[np.ndarray | None]:
@@ -134,7 +145,9 @@ class SlamResult:
         table, rows = state.problem.observations, state.rows
         m = len(state.static)
         frame = table.frame[rows]
-        predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
+        predicted = transform(
+            inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
+        )
         error = predicted - table.position[rows]
         S = state.noise.position_covariance[rows]
         objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
@@ -144,7 +157,9 @@ class SlamResult:
         np.add.at(log_odds, state.landmark, state.weight * log_ratio)
         information = np.tile(1e-12 * np.eye(3), (m, 1, 1))
         R = state.estimate.T_world_camera[frame, :3, :3]
-        np.add.at(information, state.landmark, state.weight[:, None, None] * (R @ np.linalg.inv(S) @ np.swapaxes(R, 1, 2)))
+        np.add.at(
+            information, state.landmark, state.weight[:, None, None] * (R @ np.linalg.inv(S) @ np.swapaxes(R, 1, 2))
+        )
         log_odds += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
         return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700)))
 

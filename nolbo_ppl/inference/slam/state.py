@@ -37,7 +37,11 @@ RETRACK = 2.5
 
 
 def first_estimate(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, rows: Int[np.ndarray, " k"], landmark: Int[np.ndarray, " k"],
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"],
     landmarks: int,
 ) -> Estimate:
     """Landmarks at the weighted mean of their detections in the odometry frame, oriented as most of them agree."""
@@ -81,7 +85,9 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     """
     table, rows = state.problem.observations, state.rows
     frame = table.frame[rows]
-    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
+    predicted = transform(
+        inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
+    )
     error = predicted - table.position[rows]
     S = state.noise.position_covariance[rows]
     objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
@@ -135,7 +141,10 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
     if all(stated_scales(config)) or not len(tracklets):
         return state
     # Tracks were broken where the default scales were much too small: track once more with the better ones.
-    growth = np.median(state.noise.rotation_step / noise.rotation_step), np.median(state.noise.translation_step / noise.translation_step)
+    growth = (
+        np.median(state.noise.rotation_step / noise.rotation_step),
+        np.median(state.noise.translation_step / noise.translation_step),
+    )
     if max(growth) < RETRACK:
         return state
     noise = replace(noise, rotation_step=state.noise.rotation_step, translation_step=state.noise.translation_step)

@@ -47,7 +47,9 @@ class Tracklets:
 class Tracker:
     """The live tracks, advanced frame by frame; what the batch front end and the online one share."""
 
-    def __init__(self, config: SlamConfig, dimension: int, prior: FeaturePrior, new_rate: float, clutter_rate: float) -> None:
+    def __init__(
+        self, config: SlamConfig, dimension: int, prior: FeaturePrior, new_rate: float, clutter_rate: float
+    ) -> None:
         self.config, self.prior = config, prior
         self.new_rate, self.clutter_rate = new_rate, clutter_rate
         self.index = np.zeros(0, dtype=np.int64)
@@ -61,7 +63,9 @@ class Tracker:
         self.category = np.zeros(0, dtype=np.int64)
         self.total = 0
 
-    def predict(self, T_world_camera: Float[np.ndarray, "4 4"], frame: int, rotation_step: float, translation_step: float) -> None:
+    def predict(
+        self, T_world_camera: Float[np.ndarray, "4 4"], frame: int, rotation_step: float, translation_step: float
+    ) -> None:
         """Drop tracks not seen for long; widen the others by the drift of one step at their distance."""
         live = frame - self.last <= self.config.track_gap
         if not live.all():
@@ -76,12 +80,21 @@ class Tracker:
             setattr(self, name, getattr(self, name)[rows])
 
     def associate(
-        self, position: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"],
-        R_world_object: Float[np.ndarray, "n 3 3"], rotation_scale: Float[np.ndarray, " n"], symmetry: Int[np.ndarray, " n"],
-        latent: Float[np.ndarray, "n d"], latent_variance: Float[np.ndarray, "n d"], category: Int[np.ndarray, " n"],
-        objectness: Float[np.ndarray, " n"], frame: int,
+        self,
+        position: Float[np.ndarray, "n 3"],
+        covariance: Float[np.ndarray, "n 3 3"],
+        R_world_object: Float[np.ndarray, "n 3 3"],
+        rotation_scale: Float[np.ndarray, " n"],
+        symmetry: Int[np.ndarray, " n"],
+        latent: Float[np.ndarray, "n d"],
+        latent_variance: Float[np.ndarray, "n d"],
+        category: Int[np.ndarray, " n"],
+        objectness: Float[np.ndarray, " n"],
+        frame: int,
     ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1: background."""
+        """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1:
+        background.
+        """
         n, m = len(position), len(self.index)
         log_likelihood = np.full((n, m), -np.inf)
         log_object, log_background = np.log(objectness), np.log1p(-objectness) + np.log(self.clutter_rate)
@@ -147,7 +160,9 @@ class Tracker:
         self.mean[j] += gain @ (position - self.mean[j])
         self.covariance[j] = self.covariance[j] - gain @ self.covariance[j]
         self.covariance[j] = 0.5 * (self.covariance[j] + self.covariance[j].T)
-        self.latent[j], self.latent_variance[j] = fuse_latent(self.latent[j], self.latent_variance[j], latent, latent_variance)
+        self.latent[j], self.latent_variance[j] = fuse_latent(
+            self.latent[j], self.latent_variance[j], latent, latent_variance
+        )
         # The last orientation stands for the track: averaging over possible flips would need its modes.
         if np.isfinite(rotation_scale) and not np.isfinite(self.rotation_scale[j]):
             self.R_world_object[j], self.rotation_scale[j] = R_world_object, rotation_scale
@@ -185,9 +200,15 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
 
 
 def summarise_tracks(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, assigned: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"]
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    assigned: Int[np.ndarray, " k"],
+    weight: Float[np.ndarray, " k"],
 ) -> Tracklets:
-    """First and last frame, length, and a motion test of every track; short tracks are dissolved, numbers are repacked."""
+    """First and last frame, length, and a motion test of every track; short tracks are dissolved, numbers are
+    repacked.
+    """
     table = problem.observations
     total = int(assigned.max(initial=-1)) + 1
     count = np.bincount(assigned[assigned >= 0], minlength=total)
@@ -200,7 +221,9 @@ def summarise_tracks(
     np.minimum.at(first, assigned[used], table.frame[used])
     np.maximum.at(last, assigned[used], table.frame[used])
     moving = moving_tracks(problem, noise, config, assigned, m)
-    return Tracklets(assigned, np.where(used, weight, 0.0), first, last, count[keep] if total else np.zeros(0, int), moving)
+    return Tracklets(
+        assigned, np.where(used, weight, 0.0), first, last, count[keep] if total else np.zeros(0, int), moving
+    )
 
 
 def moving_tracks(
@@ -208,7 +231,8 @@ def moving_tracks(
 ) -> Bool[np.ndarray, " m"]:
     """Tracks whose positions are explained much better by a constant velocity than by rest.
 
-    The evidence is the fall of the weighted sum of squares when each coordinate is given a slope in time, less half a log
+    The evidence is the fall of the weighted sum of squares when each coordinate is given a slope in time, less half a
+    log
     of the sample size for each of the three slopes (BIC). Residuals are in the odometry frame; its drift over the track
     is part of the variance.
     """

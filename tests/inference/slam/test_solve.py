@@ -166,9 +166,17 @@ def test_moving_objects_do_not_bend_the_trajectory() -> None:
     # A vehicle ahead that keeps its distance: static in the camera's frame, moving in the world.
     ahead = transform(inverse(world.truth[frames]), transform(world.truth[frames], np.array([0.5, 1.0, 12.0])))
     ahead += 0.1 * rng.standard_normal(ahead.shape)
-    mover = make_table(frames, ahead, position_scale=0.3, rotation=np.tile(np.eye(3), (len(frames), 1, 1)), rotation_scale=0.05,
-                       latent=rng.standard_normal((len(frames), 6)), latent_scale=0.7, category=["c0"] * len(frames),
-                       id=[f"mover-{t}" for t in frames])
+    mover = make_table(
+        frames,
+        ahead,
+        position_scale=0.3,
+        rotation=np.tile(np.eye(3), (len(frames), 1, 1)),
+        rotation_scale=0.05,
+        latent=rng.standard_normal((len(frames), 6)),
+        latent_scale=0.7,
+        category=["c0"] * len(frames),
+        id=[f"mover-{t}" for t in frames],
+    )
     both = concatenate([world.observations, mover])
     clean = solve(SlamProblem(world.odometry, world.observations), CONFIG)
     result = solve(SlamProblem(world.odometry, both), CONFIG)
@@ -186,7 +194,9 @@ def test_poor_input_gives_an_answer(case: str) -> None:
     if case == "no observations":
         table = empty_table()
     elif case == "one landmark":
-        table = table.select(world.object_of[: len(table)] == world.object_of[np.argmax(world.object_of[: len(table)] >= 0)])
+        table = table.select(
+            world.object_of[: len(table)] == world.object_of[np.argmax(world.object_of[: len(table)] >= 0)]
+        )
     elif case == "one frame":
         odometry, table = odometry[:1], table.select(table.frame == 0)
     elif case == "one observation":
