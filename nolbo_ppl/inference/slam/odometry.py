@@ -52,11 +52,8 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
     names, landmark = np.unique(state.landmark[inside], return_inverse=True)
     table = state.problem.observations.select(state.rows[inside])
     table = replace(table, frame=table.frame - first)
-    # The caution in the factors would pass errors of the odometry for errors of the detector.
     noise = replace(
         state.noise,
-        position_factor=1.0,
-        rotation_factor=1.0,
         rotation_step=state.noise.rotation_step[first : first + length - 1],
         translation_step=state.noise.translation_step[first : first + length - 1],
         position_covariance=state.noise.position_covariance[state.rows[inside]],
