@@ -122,29 +122,3 @@ def weighted_latents(
     known = precision > 1.0 / LARGE_VARIANCE
     mean = np.where(known, total / np.where(known, precision, 1.0), 0.0)
     return mean, np.where(known, 1.0 / np.where(known, precision, 1.0), LARGE_VARIANCE)
-
-
-def latent_population_log_ratio(
-    latent: Float[np.ndarray, "m d"],
-    variance: Float[np.ndarray, "m d"],
-    a: Int[np.ndarray, " p"],
-    b: Int[np.ndarray, " p"],
-) -> Float[np.ndarray, " p"]:
-    """Log ratio of tracklet a's latent given that of b to its density in the population of all other tracklets.
-
-    The population is the kernel mixture `1/M sum_c N(a; c, variance_a + variance_c)` over every tracklet but a.
-    """
-    m, d = latent.shape
-    if not d or not len(a):
-        return np.zeros(len(a))
-    known = variance[:, 0] < LARGE_VARIANCE
-    rows = np.unique(a)
-    log_density = np.full((m, m), -np.inf)
-    members = np.flatnonzero(known)
-    for i in rows[known[rows]]:
-        others = members[members != i]
-        log_density[i, others] = latent_log_density(latent[i], latent[others], variance[i] + variance[others])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        population = np.logaddexp.reduce(log_density, axis=1) - np.log(max(len(members) - 1, 1))
-        ratio = log_density[a, b] - population[a]
-    return np.where(known[a] & known[b], np.maximum(np.nan_to_num(ratio, nan=0.0, neginf=-1e3), -1e3), 0.0)

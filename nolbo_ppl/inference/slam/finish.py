@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from nolbo_ppl.inference.slam.calibration import calibrate
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
@@ -141,8 +141,3 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
 def final_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     """The graph of the final state."""
     return base_graph(state)
-
-
-def weight_totals(associations: Associations, landmarks: int) -> Float[np.ndarray, " m"]:
-    """Sum of the association weights of each landmark."""
-    return np.bincount(associations.landmark, weights=associations.weight, minlength=landmarks)

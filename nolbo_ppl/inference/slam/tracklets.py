@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nolbo_ppl.geometry.pose import inverse, transform
+from nolbo_ppl.geometry.pose import transform
 from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fuse_latent
@@ -262,8 +262,3 @@ def moving_tracks(
     gain = 0.5 * np.sum(slope**2, axis=1) / slope_variance[:, 0]
     n = np.bincount(a, minlength=tracks)
     return (n >= 3) & (gain - 1.5 * np.log(np.maximum(n, 1)) > config.motion_log_odds)
-
-
-def frame_of_reference(problem: SlamProblem, frame: int) -> np.ndarray:
-    """`T_camera_world` of one odometry row."""
-    return inverse(problem.odometry[frame])
