@@ -22,13 +22,12 @@ def test_notebooks_are_stored_as_python_only() -> None:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_and_pictures_what_it_says(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(os.environ, "OMP_NUM_THREADS", "1")
+    monkeypatch.setitem(os.environ, "PYTHONWARNINGS", "ignore:IProgress not found")  # tqdm's, for want of widgets
     notebook = jupytext.read(path)
     resources = {"metadata": {"path": str(path.parent)}}
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    pictures = [
-        output for cell in cells for output in cell.outputs if "image/png" in output.get("data", {})
-    ]
+    pictures = [output for cell in cells for output in cell.outputs if "image/png" in output.get("data", {})]
     assert len(pictures) >= 10
     for cell in cells:
         for output in cell.outputs:

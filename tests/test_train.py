@@ -272,7 +272,7 @@ def test_boxes_alone_train_and_are_not_calibrated_on_a_handful(folders: tuple[Pa
     assert values["calibrated"] is False
     assert set(values["calibration"].values()) == {0.0, 1.0}
     with_objects = [row for row in rows(tmp_path / "run") if "loss" in row]
-    assert all(row["terms/orientation_inclusive"] == 0 for row in with_objects)
+    assert all(row["terms/azimuth_inclusive"] == row["terms/tilt_inclusive"] == 0 for row in with_objects)
     assert all(row["terms/box_inclusive"] < 0 for row in with_objects)
 
 
