@@ -21,27 +21,27 @@ from nolbo_ppl.models.scene import SceneBatch
 class Augmentation:
     """Ranges and probabilities; ranges are (least, greatest)."""
 
-    scale: tuple[float, float] = (0.8, 1.3)
+    scale: tuple[float, float] = (0.9, 1.15)
     """Zoom factor, log-uniform."""
-    translation: float = 0.12
+    translation: float = 0.08
     """Greatest shift along each side, as a share of the image."""
-    geometric_probability: float = 0.7
+    geometric_probability: float = 0.5
     """Share of images that are scaled and shifted."""
-    brightness: float = 25.0
+    brightness: float = 15.0
     """Greatest change of brightness, of 255."""
-    contrast: tuple[float, float] = (0.75, 1.3)
+    contrast: tuple[float, float] = (0.85, 1.2)
     """Factor of the contrast about mid-grey, log-uniform."""
-    saturation: tuple[float, float] = (0.4, 1.5)
+    saturation: tuple[float, float] = (0.7, 1.3)
     """Factor of the saturation."""
-    hue: float = 0.25
+    hue: float = 0.1
     """Greatest turn of the hue, rad."""
-    inversion_probability: float = 0.02
+    inversion_probability: float = 0.01
     """Share of images with inverted colours."""
-    blur_probability: float = 0.25
+    blur_probability: float = 0.1
     """Share of blurred images."""
-    noise_probability: float = 0.2
+    noise_probability: float = 0.1
     """Share of images with added noise."""
-    noise: float = 10.0
+    noise: float = 6.0
     """Greatest scale of the added noise, of 255."""
     least_visible: float = 0.1
     """Objects of which less stays visible in the image lose their label."""
