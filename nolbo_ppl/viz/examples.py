@@ -114,7 +114,7 @@ def _draw_example(
     show_part(axes, truth.image, (centre[0] - wide, centre[0] + wide), (centre[1] - half, centre[1] + half))
     if np.isfinite(truth.position[slot]).all() and np.isfinite(truth.R_camera_object[slot]).all():
         # At the true place and at a size that fills the box, so that only the directions differ.
-        length = 0.9 * half * float(truth.position[slot, 2] / truth.intrinsics[:2].mean())
+        length = 0.7 * half * float(truth.position[slot, 2] / truth.intrinsics[:2].mean())
         draw_frame(axes, answer.R_camera_object[0], truth.position[slot], length, truth.intrinsics)
         draw_frame(
             axes, truth.R_camera_object[slot], truth.position[slot], length, truth.intrinsics, colours=TRUE_AXES,

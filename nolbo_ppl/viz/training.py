@@ -107,7 +107,7 @@ def _draw_terms(axes: Axes, title: str, prefix: str, rows: Sequence[dict[str, An
             total[step] = total.get(step, 0.0) + value
     if total:
         axes.plot(list(total), list(total.values()), color=INK, linewidth=1.8, label="sum")
-        axes.legend(loc="best", ncols=2, fontsize=6.5)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize=6.5)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set(xlabel="step", title=title)
@@ -128,5 +128,5 @@ def _draw_figures(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
         right.set(ylabel="median viewpoint error, degrees (dotted)", ylim=(0, None))
         right.spines["right"].set_visible(True)
     axes.set(ylim=(0, 1.02), xlabel="step", title="held out: figures")
-    axes.legend(loc="lower right")
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=len(FIGURES), fontsize=6.5, columnspacing=1.0)
     grid(axes)
