@@ -150,7 +150,7 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
     ids: dict[str, int] = {}
     dimension: int | None = None
     for number, row in read_jsonl(path):
-        where = {"file": path, "line": number}
+        where: dict[str, Any] = {"file": path, "line": number}
         unknown = set(row) - _KNOWN - CARRIED
         if unknown:
             raise input_error("unknown field", got=sorted(unknown), expected=f"some of {sorted(_KNOWN)}", **where)
