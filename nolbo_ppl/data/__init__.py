@@ -1,1 +1,1 @@
-
+"""Data: shapes, scenes, data sets and batches; trajectories, observations and converters."""

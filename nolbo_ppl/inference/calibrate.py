@@ -39,8 +39,8 @@ def _fit(loss, start: list[float]) -> list[float]:
     def value_and_gradient(x):
         parameters = torch.tensor(x, dtype=torch.float64, requires_grad=True)
         value = loss(parameters)
-        value.backward()
-        return float(value.detach()), parameters.grad.numpy()
+        (gradient,) = torch.autograd.grad(value, parameters)
+        return float(value.detach()), gradient.numpy()
 
     return [float(v) for v in minimize(value_and_gradient, start, jac=True, method="L-BFGS-B").x]
 

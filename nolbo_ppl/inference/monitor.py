@@ -25,7 +25,7 @@ def held_out(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
     `med_err_deg` (objects of categories without declared symmetry), `azimuth_in_90` (share of true azimuths inside the
     90 % region).
     """
-    training = model.training
+    training = [module for module in model.modules() if module.training]  # a frozen part stays in evaluation mode
     model.eval()
     sums: dict[str, float] = {}
     scenes = 0
@@ -39,7 +39,8 @@ def held_out(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
                 key = f"{prefix}/{name.removesuffix('_inclusive')}"
                 sums[key] = sums.get(key, 0.0) + float(value)
         _collect(model, scene, found)
-    model.train(training)
+    for module in training:
+        module.training = True
     result = {name: value / max(scenes, 1) for name, value in sums.items()}
     result["bound"] = sum(value for name, value in result.items() if name.startswith("bound/"))
     stacked = {name: torch.cat(values) if values else torch.zeros(0) for name, values in found.items()}

@@ -29,7 +29,7 @@ class OptimisationConfig:
     learning_rate: float = 2.5e-3
     """Rate after the warm-up."""
     start_rate: float = 1e-5
-    """Rate of the first step; it grows linearly to `learning_rate` over the warm-up."""
+    """Rate the warm-up starts from: it grows linearly to `learning_rate`, which its last step reaches."""
     warmup: int = 100
     """Steps of warm-up."""
     decay: float = 0.25
@@ -135,12 +135,12 @@ def _update_average(state: OptimisationState) -> None:
 
 
 def state_tensors(state: OptimisationState) -> dict[str, Tensor]:
-    """All tensors of a state, for a checkpoint: `model/...`, `average/...`, `optimizer/...`."""
+    """Copies of all tensors of a state, for a checkpoint: `model/...`, `average/...`, `optimizer/...`."""
     names = {id(p): name for name, p in state.module.named_parameters()}
     return {
-        **{f"model/{name}": value for name, value in state.module.state_dict().items()},
+        **{f"model/{name}": value.clone() for name, value in state.module.state_dict().items()},
         **{f"average/{name}": value.clone() for name, value in state.average.items()},
-        **{f"optimizer/{name}": value for name, value in optimizer_tensors(state.optimizer, names).items()},
+        **{f"optimizer/{name}": value.clone() for name, value in optimizer_tensors(state.optimizer, names).items()},
     }
 
 

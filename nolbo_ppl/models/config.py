@@ -134,7 +134,8 @@ class ModelConfig:
         unknown = sorted(set(values) - names)
         if unknown:
             raise input_error("unknown model configuration", got=unknown, expected=f"fields among {sorted(names)}")
-        return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+        fields: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+        return cls(**fields)
 
 
 def tiny() -> ModelConfig:

@@ -62,18 +62,17 @@ class RegionHead(nn.Module):
         linear = config.encoder == "darknet19"
         self.objectness = nn.Linear(channels, config.predictors, bias=not linear)
         width = config.head_width
-        self.outputs = (
-            nn.Linear(channels, outputs, bias=False)
-            if linear
-            else nn.Sequential(
+        if linear:
+            self.outputs: nn.Module = nn.Linear(channels, outputs, bias=False)
+        else:
+            last = nn.Linear(width, outputs)
+            self.outputs = nn.Sequential(
                 nn.Linear(channels, width), nn.LayerNorm(width), nn.GELU(),
                 nn.Linear(width, width), nn.LayerNorm(width), nn.GELU(),
-                nn.Linear(width, outputs),
-            )
-        )  # fmt: skip
-        if not linear:
+                last,
+            )  # fmt: skip
             nn.init.constant_(self.objectness.bias, -4.0)
-            nn.init.normal_(self.outputs[-1].weight, std=0.02)
+            nn.init.normal_(last.weight, std=0.02)
         self.register_buffer("start", self._start(), persistent=False)
 
     def _start(self) -> Float[Tensor, "predictors outputs"]:

@@ -21,6 +21,11 @@ class Nolbo(nn.Module):
         self.guide = Guide(config, self.story.prior)
         self.shape_guide = ShapeGuide(config)
 
+    def set_half_precision(self, enabled: bool) -> None:
+        """Run the networks' convolutions and dense layers in bfloat16 (weights, latents and the bound stay as they are)."""
+        for part in (self.guide, self.story.decoder, self.shape_guide.encoder):
+            part.half_precision = enabled
+
     @property
     def shape_story(self) -> ShapeStory:
         """The story of shapes alone, sharing prior and decoder."""

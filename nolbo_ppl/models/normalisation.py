@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.distributed as distributed
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_reduce
 from torch.nn.modules.batchnorm import _BatchNorm
+
+
+class _SumOverProcesses(torch.autograd.Function):
+    """Sum of a tensor over all processes, and of its gradient on the way back."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor) -> Tensor:
+        total = value.clone()
+        distributed.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+        return _SumOverProcesses.forward(ctx, grad_outputs[0])
+
+
+def world_size() -> int:
+    """Number of processes that train together; 1 when there is no process group."""
+    return distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
 
 
 class _JointStatistics(_BatchNorm):
@@ -18,15 +38,16 @@ class _JointStatistics(_BatchNorm):
 
     def forward(self, input: Tensor) -> Tensor:
         """Normalise by the joint statistics in training, by the running ones in evaluation."""
-        world = distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
-        if not self.training or world == 1:
+        if not self.training or world_size() == 1:
             return super().forward(input)
         assert self.running_mean is not None and self.running_var is not None and self.num_batches_tracked is not None
         x = input.float() if input.dtype == torch.bfloat16 else input
         dims = [d for d in range(x.dim()) if d != 1]
         local = x.new_tensor([x.numel() / x.shape[1]])
-        sums = all_reduce(torch.cat((x.sum(dims), x.square().sum(dims), local)))
-        count = sums[-1].detach()  # processes may hold different numbers of objects
+        sums = _SumOverProcesses.apply(torch.cat((x.sum(dims), x.square().sum(dims), local)))
+        count = sums[-1].detach()  # processes may hold different numbers of objects, or none
+        if float(count) == 0:
+            return input
         mean, square = (sums[:-1] / count).chunk(2)
         variance = (square - mean.square()).clamp_min(0)
         with torch.no_grad():

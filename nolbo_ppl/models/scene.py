@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -58,13 +59,13 @@ class SceneBatch:
     noise: Float[Tensor, "b m d"] | None = None
     """Standard normal noise of the shape latent's sample; drawn from torch's generator when it is not given."""
 
-    def replace(self, **changes: Tensor | None) -> SceneBatch:
+    def replace(self, **changes: Any) -> SceneBatch:
         """A copy with other fields."""
         return dataclasses.replace(self, **changes)
 
     def to(self, dtype: torch.dtype) -> SceneBatch:
         """A copy with floating-point fields of another precision."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return SceneBatch(
             **{k: v.to(dtype) if v is not None and v.is_floating_point() else v for k, v in fields.items()}
         )
@@ -89,8 +90,9 @@ class SceneBatch:
 
     def __getitem__(self, index: slice | Tensor) -> SceneBatch:
         """Some of the scenes."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return SceneBatch(**{k: None if v is None else v[index] for k, v in fields.items()})
+        fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        fields = {k: None if v is None else v[index] for k, v in fields.items()}
+        return SceneBatch(**fields)
 
 
 @dataclass

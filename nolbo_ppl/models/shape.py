@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -39,15 +40,46 @@ class VoxelDecoder(nn.Module):
         channels = config.decoder_channels
         self.dense = nn.Linear(config.latent_dim, channels[0] * 64)
         layers: list[nn.Module] = [SyncBatchNorm3d(channels[0]), nn.ELU()]
-        for inputs, outputs in zip(channels[:-1], channels[1:]):
+        for inputs, outputs in pairwise(channels):
             layers += [nn.ConvTranspose3d(inputs, outputs, 4, 2, 1, bias=False), SyncBatchNorm3d(outputs), nn.ELU()]
-        layers.append(nn.ConvTranspose3d(channels[-1], 1, 4, 2, 1))
+        last = PatchWriter(channels[-1]) if config.voxel_patches else nn.ConvTranspose3d(channels[-1], 1, 4, 2, 1)
+        layers.append(last)
         self.layers = nn.Sequential(*layers)
         self.channels = channels[0]
+        self.half_precision = False
 
     def forward(self, latent: Float[Tensor, "n d"]) -> Float[Tensor, "n v v v"]:
         """Occupancy logits, axes x, y, z of the canonical frame."""
-        return self.layers(self.dense(latent).unflatten(-1, (self.channels, 4, 4, 4))).squeeze(1)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
+            logits = self.layers(self.dense(latent).unflatten(-1, (self.channels, 4, 4, 4)))
+        return logits.squeeze(1).to(latent.dtype)
+
+
+class PatchWriter(nn.Module):
+    """Transposed convolution of kernel 2 and stride 2 to one channel, as one matrix product."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels, 8)
+
+    def forward(self, x: Float[Tensor, "n c v v v"]) -> Float[Tensor, "n 1 w w w"]:
+        """Eight voxels from each cell of the grid."""
+        cells = self.linear(x.movedim(1, -1)).unflatten(-1, (2, 2, 2))  # n x y z a b c
+        return cells.permute(0, 1, 4, 2, 5, 3, 6).flatten(5, 6).flatten(3, 4).flatten(1, 2)[:, None]
+
+
+class PatchReader(nn.Module):
+    """4^3 patches of one channel through two dense layers: a grid of a quarter of the side."""
+
+    def __init__(self, hidden: int, outputs: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(64, 2 * hidden), nn.ELU(), nn.Linear(2 * hidden, outputs))
+
+    def forward(self, x: Float[Tensor, "n 1 w w w"]) -> Float[Tensor, "n c v v v"]:
+        """Features of each patch."""
+        v = x.shape[-1] // 4
+        patches = x[:, 0].unflatten(3, (v, 4)).unflatten(2, (v, 4)).unflatten(1, (v, 4))  # n x a y b z c
+        return self.layers(patches.permute(0, 1, 3, 5, 2, 4, 6).flatten(4)).movedim(-1, 1)
 
 
 class VoxelEncoder(nn.Module):
@@ -55,17 +87,25 @@ class VoxelEncoder(nn.Module):
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
+        channels = config.voxel_encoder_channels
         layers: list[nn.Module] = []
         inputs = 1
-        for outputs in config.voxel_encoder_channels:
+        if config.voxel_patches:
+            inputs = channels[1]
+            layers += [PatchReader(channels[0], inputs), nn.ELU()]
+            channels = channels[2:]
+        for outputs in channels:
             layers += [nn.Conv3d(inputs, outputs, 4, 2, 1, bias=False), SyncBatchNorm3d(outputs), nn.ELU()]
             inputs = outputs
         self.layers = nn.Sequential(*layers)
         self.dense = nn.Linear(inputs * 64, 2 * config.latent_dim)
+        self.half_precision = False
 
     def forward(self, voxels: Float[Tensor, "n v v v"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
         """Mean and scale of the latent of each shape; scales stay between exp(-6) and exp(2)."""
-        loc, log_scale = self.dense(self.layers(2 * voxels[:, None] - 1).flatten(1)).chunk(2, -1)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
+            features = self.layers(2 * voxels[:, None] - 1).flatten(1)
+        loc, log_scale = self.dense(features.to(voxels.dtype)).chunk(2, -1)
         return loc, bounded_exp(log_scale, -6.0, 2.0)
 
 

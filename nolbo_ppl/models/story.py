@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import pyro
@@ -36,6 +37,7 @@ from nolbo_ppl.models.distributions import (
 )
 from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.guide import ObservedScene
+from nolbo_ppl.models.normalisation import world_size
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.rotation_term import expected_rotation_log_prob
 from nolbo_ppl.models.scene import SceneBatch, unpack_bits
@@ -144,11 +146,11 @@ class Story(nn.Module):
         total = len(index)
         if decode is not None and total > decode:
             index = index[:decode]  # batches come shuffled: the first objects are a random subset
-        if len(index) == 0:
-            return
+        if decode == 0 or (len(index) == 0 and world_size() == 1):
+            return  # with other processes an empty batch goes through, for their normalisation waits for every one
         logits = self.decoder(latent.expand(*assigned.shape, -1).flatten(0, 1)[index])
         observed = unpack_bits(batch.voxels.flatten(0, 1)[index], self.config.voxel_size).to(logits.dtype)
-        voxel_site(logits, observed, total / len(index))
+        voxel_site(logits, observed, total / max(len(index), 1))
 
 
 def _normal_expectation(observed: Tensor, scale: float) -> Callable[[dist.TorchDistribution], Tensor]:
@@ -202,5 +204,6 @@ def _teacher(batch: SceneBatch, assigned: Tensor, part: slice) -> dict[str, Any]
 
 def voxel_site(logits: Float[Tensor, "n v v v"], observed: Float[Tensor, "n v v v"], scale: float = 1.0) -> None:
     """Voxels of n decoded objects, independent Bernoulli; `scale` makes a subset stand for all."""
-    with pyro.plate("decoded", len(logits), dim=-1), poutine.scale(scale=scale):
+    plate = pyro.plate("decoded", len(logits), dim=-1) if len(logits) else nullcontext()  # Pyro knows no empty plate
+    with plate, poutine.scale(scale=scale):
         pyro.sample("voxels", dist.Bernoulli(logits=logits, validate_args=False).to_event(3), obs=observed)
