@@ -32,7 +32,7 @@ class OptimisationConfig:
     """Rate the warm-up starts from: it grows linearly to `learning_rate`, which its last step reaches."""
     warmup: int = 100
     """Steps of warm-up."""
-    decay: float = 0.25
+    decay: float = 0.5
     """Share of the steps, at the end, over which the rate falls to 2 % along a cosine."""
     weight_decay: float = 0.01
     """Decoupled weight decay of matrices and kernels (none on biases and norms)."""
