@@ -22,6 +22,7 @@ def save_tensors(path: str | PathLike[str], tensors: Mapping[str, Tensor], meta:
     with atomic_path(path) as temporary:
         contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
         save_file(contiguous, temporary, metadata={"meta": json.dumps(meta)})
+        temporary.chmod(0o644)  # safetensors lets nobody but the owner read: weights of a package are for all users
 
 
 def load_tensors(path: str | PathLike[str]) -> tuple[dict[str, Tensor], dict[str, Any]]:
