@@ -21,9 +21,7 @@ class SlamArguments:
     """Correct a drifting trajectory by the objects seen along it, and map them with uncertainty."""
 
     odometry: Path
-    """Odometry: KITTI (12 numbers a row) or TUM (`time x y z qx qy qz qw`), T_world_camera, x right, y down, z
-    forward.
-    """
+    """Odometry: KITTI (12 numbers a row) or TUM (`time x y z qx qy qz qw`), T_world_camera, x right, y down, z forward."""
     observations: Path
     """Observations: JSON Lines, one detection a line (see docs/slam.md)."""
     out: Path

@@ -162,7 +162,7 @@ def check_table(table: ObservationTable, frames: int) -> None:
            f"within {MAXIMUM_DISTANCE:g} m")
     given = ~np.isnan(table.position_covariance).all(axis=(1, 2))
     covariance = np.where(given[:, None, None], table.position_covariance, np.eye(3))
-    finite = np.isfinite(covariance).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     refuse(~finite, "position covariance is not finite", covariance, "finite m^2")
     symmetric = np.abs(covariance - np.swapaxes(covariance, 1, 2)).max(axis=(1, 2), initial=0) <= 1e-6 * np.abs(
         covariance).max(axis=(1, 2), initial=0)

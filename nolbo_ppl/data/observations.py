@@ -141,8 +141,7 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
         frames: number of rows of the odometry; frames outside raise.
 
     Raises:
-        InputError: a missing file, a malformed line, unknown or bad fields, latents of different lengths, duplicate
-            ids,
+        InputError: a missing file, a malformed line, unknown or bad fields, latents of different lengths, duplicate ids,
             frames out of range; names file and line.
     """
     path = Path(path)

@@ -31,11 +31,10 @@ def draw_map(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     i, j = principal_plane(estimate[:, :3, 3])
-    for label, T, style in (("odometry", odometry, {"color": "0.6", "lw": 1.0}),
-                            ("truth", truth, {"color": "k", "lw": 1.0, "ls": "--"}),
-                            ("estimate", estimate, {"color": "tab:blue", "lw": 1.5})):
+    for label, T, colour, width, dashes in (("odometry", odometry, "0.6", 1.0, "-"), ("truth", truth, "k", 1.0, "--"),
+                                            ("estimate", estimate, "tab:blue", 1.5, "-")):
         if T is not None:
-            axes.plot(T[:, i, 3], T[:, j, 3], label=label, **style)
+            axes.plot(T[:, i, 3], T[:, j, 3], label=label, color=colour, linewidth=width, linestyle=dashes)
     if landmarks is not None and len(landmarks):
         axes.plot(landmarks[:, i], landmarks[:, j], ".", color="tab:red", ms=3, label=f"{len(landmarks)} landmarks")
         for k in range(len(landmarks) if covariance is not None else 0):

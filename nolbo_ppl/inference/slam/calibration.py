@@ -23,8 +23,7 @@ CLIP = 3.0
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
 UNSTATED_FACTOR = 4.0
-"""Least factor where nobody stated a scale: detectors are biased by view, which residuals about one track do not show.
-"""
+"""Least factor where nobody stated a scale: detectors are biased by view, which residuals about one track do not show."""
 LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
@@ -32,9 +31,7 @@ LEAST_DETECTIONS = 30
 def correlation_factor(
     whitened: Float[np.ndarray, "k c"], track: Int[np.ndarray, " k"], frame: Int[np.ndarray, " k"]
 ) -> float:
-    """Factor on covariances that makes up for correlated errors: `(1 + r) / (1 - r)` of a first-order process, at
-    least 1.
-    """
+    """Factor on covariances that makes up for correlated errors: `(1 + r) / (1 - r)` of a first-order process, at least 1."""
     order = np.lexsort((frame, track))
     z = np.clip(whitened[order], -CLIP, CLIP)
     follows = (np.diff(track[order]) == 0) & (np.diff(frame[order]) <= 2)
@@ -59,8 +56,7 @@ def _width(whitened: np.ndarray, count: np.ndarray) -> float:
 def calibrate(state: SlamState) -> SlamState:
     """Widen position and rotation scales to the residuals about the solved tracks, and account for their correlation.
 
-    Scales the user stated are widened only when they are too small by more than a third (reported) and
-    `correct_scales`.
+    Scales the user stated are widened only when they are too small by more than a third (reported) and `correct_scales`.
     """
     table, rows = state.problem.observations, state.rows
     noise, config = state.noise, state.config

@@ -12,6 +12,7 @@ from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.data.observations import ObservationTable, check_table
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation
+from nolbo_ppl.inference.association.marginals import Associator
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class SlamConfig:
     """Width of the Cauchy kernel on links between tracklets, in standard deviations."""
     seed: int = 0
     """Seed of the posterior samples."""
-    associator: str = "exact"
+    associator: Associator = "exact"
     """How association marginals are computed (see `nolbo_ppl.inference.association`)."""
 
 

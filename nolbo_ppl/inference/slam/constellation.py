@@ -2,9 +2,8 @@
 
 One pair after drift is ambiguous; several that imply the same motion are not. Two pairs are consistent when their gaps
 differ by no more than the graph's own covariance of that difference allows: distance, direction and relative rotation
-in
-one test. A maximum clique of consistent pairs is accepted on its joint log evidence, and only when no other clique that
-implies another motion comes close.
+in one test. A maximum clique of consistent pairs is accepted on its joint log evidence, and only when no other clique
+that implies another motion comes close.
 """
 
 from __future__ import annotations
@@ -67,8 +66,7 @@ def consistency(
 def joint_log_density(
     gap: Float[np.ndarray, "c 3"], deviation: Float[np.ndarray, "c 3 s"], inflation: float, floor: float, rank: int = 6
 ) -> float:
-    """Log density of all gaps at once: drift common to the group (its leading directions) plus a part of each pair's
-    own.
+    """Log density of all gaps at once: drift common to the group (its leading directions) plus a part of each pair's own.
 
     A covariance of samples alone underestimates its small eigenvalues as the group grows; hence the factor form.
     """
@@ -99,10 +97,9 @@ def promising_nodes(together: Bool[np.ndarray, "p p"], minimum: int) -> Int[np.n
     """Nodes of the largest greedy cliques, at most NODES_SEARCHED: the full search on all of them takes a hundred
     times as long.
 
-    Without features (poles) a window has hundreds of candidate pairs and ten thousands of maximal cliques, most of
-    them tiny.
+    Without features (poles) a window has hundreds of candidate pairs and ten thousands of maximal cliques, most of them tiny.
     """
-    cliques = [greedy_clique(together, i) for i in np.flatnonzero(together.sum(axis=1) >= minimum - 1)]
+    cliques = [greedy_clique(together, i) for i in np.flatnonzero(together.sum(axis=1) >= minimum - 1).tolist()]
     cliques = sorted((c for c in cliques if len(c) >= minimum), key=len, reverse=True)
     chosen: set[int] = set()
     for clique in cliques:

@@ -1,9 +1,8 @@
 """Drift between parts of a drive from a coarse graph: cheap posterior samples for the online system.
 
-Nodes stand for every few frames. A node's variable is the world-frame error of its pose (rotation about the origin,
-then
-translation); along the drive it is a random walk with the odometry's noise carried to the world frame, and each closed
-loop ties two nodes at the place it was closed. What tracked objects add to the odometry is left out: a little too wide.
+Nodes stand for every few frames. A node's variable is the world-frame error of its pose (rotation about the origin, then
+translation); along the drive it is a random walk with the odometry's noise carried to the world frame, and each closed loop
+ties two nodes at the place it was closed. What tracked objects add to the odometry is left out: a little too wide.
 """
 
 from __future__ import annotations

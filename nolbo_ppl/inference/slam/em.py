@@ -1,10 +1,9 @@
 """The EM between tracklets: `step` is one round of E-step (which tracklets are one object) and M-step (GTSAM).
 
 This is the working form that closes loops: relative covariances from the graph itself, inflated in the first rounds,
-links
-under a Cauchy kernel. It is not exact coordinate ascent on the bound of the plain EM
-(`nolbo_ppl.inference.slam.plain`),
-which never falls but closes no loop after drift; its log evidence is reported for each iteration with what changed.
+links under a Cauchy kernel. It is not exact coordinate ascent on the bound of the plain EM
+(`nolbo_ppl.inference.slam.plain`), which never falls but closes no loop after drift; its log evidence is reported for
+each iteration with what changed.
 """
 
 from __future__ import annotations
@@ -102,8 +101,7 @@ def soft_assignment(
 
     Tracklets seen in one frame are different objects, so within a group the association is one-to-one; a cluster (what
     earlier iterations hold to be one object) stands as one candidate, by its best member. Returns newer tracklets,
-    older
-    ones, weights, and the log evidence above all tracklets being new.
+    older ones, weights, and the log evidence above all tracklets being new.
     """
     order = np.argsort(pairs.a, kind="stable")
     sorted_a = pairs.a[order]
@@ -213,6 +211,5 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
 
 
 def density(state: SlamState) -> float:
-    """Density of landmarks in view, per m^3: five times the rate of new ones (one detection in five is of a new one).
-    """
+    """Density of landmarks in view, per m^3: five times the rate of new ones (one detection in five is of a new one)."""
     return 5.0 * state.noise.new_rate

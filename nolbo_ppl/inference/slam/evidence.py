@@ -1,9 +1,7 @@
-"""Evidence that two tracklets are one object: position gap under the graph's own relative covariance, latent,
-orientation.
+"""Evidence that two tracklets are one object: position gap under the graph's own relative covariance, latent, orientation.
 
 The covariance between any two tracklets comes from posterior samples of the linearised graph. It holds the drift
-between
-two passes of a place; the sensor's covariance alone closes no loop after drift.
+between two passes of a place; the sensor's covariance alone closes no loop after drift.
 """
 
 from __future__ import annotations

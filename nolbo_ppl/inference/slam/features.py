@@ -1,9 +1,8 @@
 """What an object looks like, as evidence: latents and categories against the population they are drawn from.
 
 A match of latents is worth only as much as it is rare: its likelihood is divided by the density of the population,
-which
-is estimated from the objects themselves. Twenty identical cars then give no evidence at all, and no match is ever worth
-more than the log of the number of objects.
+which is estimated from the objects themselves. Twenty identical cars then give no evidence at all, and no match is ever
+worth more than the log of the number of objects.
 """
 
 from __future__ import annotations
@@ -108,10 +107,8 @@ def weighted_latents(
     latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, " n"],
     weight: Float[np.ndarray, " n"], groups: int,
 ) -> tuple[Float[np.ndarray, "g d"], Float[np.ndarray, "g d"]]:
-    """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu,
-    corrected:
-    positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get
-    LARGE_VARIANCE.
+    """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu, corrected:
+    positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get LARGE_VARIANCE.
     """
     d = latent.shape[1]
     precision, total = np.zeros((groups, d)), np.zeros((groups, d))

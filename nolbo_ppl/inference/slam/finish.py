@@ -1,6 +1,4 @@
-"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, every detection associated
-anew.
-"""
+"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, every detection associated anew."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 Every landmark is a Pose3, also where no orientation is observed: a `BetweenFactorPose3` then carries a rotation part so
 loose (10 rad) that it says nothing. It converges in 5 iterations where points with bearing and range take 16. Weights
-sit
-in the noise models (scale / sqrt(w)) and are frozen while the graph is solved.
+sit in the noise models (scale / sqrt(w)) and are frozen while the graph is solved.
 """
 
 from __future__ import annotations
@@ -175,7 +174,7 @@ def add_links(graph: gtsam.NonlinearFactorGraph, links: Links, robust_width: flo
     """Between-factors of linked landmarks, weighted; under a Cauchy kernel when a width is given."""
     for k in range(len(links)):
         sigmas = np.repeat(links.scale[k], 3) / np.sqrt(max(links.weight[k], 1e-12))
-        model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         if robust_width is not None:
             model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(robust_width), model)
         graph.add(gtsam.BetweenFactorPose3(landmark_key(links.a[k]), landmark_key(links.b[k]),

@@ -137,8 +137,7 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
 def odometry_scales(
     length: Float[np.ndarray, " n"], config: SlamConfig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances.
-    """
+    """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances."""
     typical = float(np.sqrt(np.mean(length**2))) if len(length) else 1.0
     typical = max(typical, 1e-3)
     rotation = DEFAULT_ROTATION_STEP if config.odometry_rotation_scale is None else config.odometry_rotation_scale

@@ -1,6 +1,4 @@
-"""The E-step of single detections against a map: exact marginals of every frame, with new-landmark and background
-odds.
-"""
+"""The E-step of single detections against a map: exact marginals of every frame, with new-landmark and background odds."""
 
 from __future__ import annotations
 

@@ -82,9 +82,7 @@ def log_evidence(window: SlamState, rotation: float, translation: float) -> floa
 
 
 def odometry_by_evidence(state: SlamState) -> SlamState:
-    """Scale factors of the odometry (where not stated) that the tracked objects make most probable, by coordinate
-    search.
-    """
+    """Scale factors of the odometry (where not stated) that the tracked objects make most probable, by coordinate search."""
     stated_rotation, stated_translation = stated_scales(state.config)
     free = [not stated_rotation, not stated_translation]
     window = densest_window(state) if any(free) else state
@@ -140,8 +138,7 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
     """One EM update of the odometry scales: `sigma^2 <- E[r^2]` over the posterior.
 
     Stated scales stay unless they are too small by more than a third (reported, and raised with `correct_scales`);
-    scales
-    nobody stated only grow: a posterior that knows little of a step would let them creep.
+    scales nobody stated only grow: a posterior that knows little of a step would let them creep.
     """
     if len(state.problem) < 3 or not len(state.rows):
         return state

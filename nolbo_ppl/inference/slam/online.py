@@ -1,9 +1,8 @@
 """Online SLAM: a keyframe at a time on iSAM2, loops closed as tracks end, the batch map at the end.
 
-Each keyframe costs one association of its detections with live tracks, one iSAM2 update, and the read-out of one pose.
-Every few ended tracks one window of them is matched to all older ones (constellation first, the soft E-step for the
-rest)
-under the covariance of a coarse drift graph. `finish` hands tracks and closings to the batch EM for the final map.
+Each keyframe costs one association of its detections with live tracks, one iSAM2 update, and the read-out of one pose. Every
+few ended tracks one window of them is matched to all older ones (constellation first, the soft E-step for the rest) under the
+covariance of a coarse drift graph. `finish` hands tracks and closings to the batch EM for the final map.
 """
 
 from __future__ import annotations
@@ -260,9 +259,7 @@ class ObjectSlam:
     def _add_factors(
         self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, odometry: np.ndarray, frame: int
     ) -> None:
-        """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then
-        added.
-        """
+        """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
         for i, number in enumerate(assigned.tolist()):
             if number < 0:
                 continue

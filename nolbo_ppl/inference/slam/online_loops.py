@@ -1,5 +1,4 @@
-"""Loop closing of the online system: a window of ended tracks matched to all older ones under the coarse drift graph.
-"""
+"""Loop closing of the online system: a window of ended tracks matched to all older ones under the coarse drift graph."""
 
 from __future__ import annotations
 

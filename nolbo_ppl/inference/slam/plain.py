@@ -1,14 +1,11 @@
 """The plain EM of the paper, corrected: a fixed set of landmarks, sensor covariances, and a bound that never falls.
 
 Maximises the log posterior `sum_t log evidence_t(X, L, mu) + log p(odometry | X) + log p(L)` over poses X, landmark
-poses
-L and latents mu, where a frame's evidence sums over all one-to-one associations of its detections with landmarks, a new
-object or background, and over the modes of every orientation. E-step: exact marginals. M-step: GTSAM with frozen
-weights
-`w_kj * (share of the mode)` inside the noise models (NOLBO eq. EM_maximization without its second sum over
-associations,
-which counts every detection several times), then the normalised latent update. Either step alone can only raise the
-posterior. It closes no loop after drift, since its covariances hold the sensor alone: use `solve` for that.
+poses L and latents mu, where a frame's evidence sums over all one-to-one associations of its detections with landmarks,
+a new object or background, and over the modes of every orientation. E-step: exact marginals. M-step: GTSAM with frozen
+weights `w_kj * (share of the mode)` inside the noise models (NOLBO eq. EM_maximization without its second sum over
+associations, which counts every detection several times), then the normalised latent update. Either step alone can only
+raise the posterior. It closes no loop after drift, since its covariances hold the sensor alone: use `solve` for that.
 """
 
 from __future__ import annotations
@@ -185,15 +182,10 @@ def e_step(state: PlainState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarra
     log_new = np.log(objectness) + np.log(noise.new_rate)
     if table.latent_dim:
         # A new object's latent comes from the population; background shows the same, so that the terms compare.
-        population = np.where(
-            known,
-            latent_log_density(
-                latent,
-                latent[known].mean(axis=0) if known.any() else 0.0,
-                variance + latent[known].var(axis=0) if known.any() else 1.0,
-            ),
-            0.0,
-        )
+        population = np.zeros(n)
+        if known.any():
+            mean, spread = latent[known].mean(axis=0), latent[known].var(axis=0)
+            population[known] = latent_log_density(latent[known], mean, variance[known] + spread)
     else:
         population = np.zeros(n)
     log_null = np.logaddexp(log_new, np.log1p(-objectness) + np.log(noise.clutter_rate)) + population

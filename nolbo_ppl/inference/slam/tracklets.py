@@ -92,9 +92,7 @@ class Tracker:
         objectness: Float[np.ndarray, " n"],
         frame: int,
     ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1:
-        background.
-        """
+        """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1: background."""
         n, m = len(position), len(self.index)
         log_likelihood = np.full((n, m), -np.inf)
         log_object, log_background = np.log(objectness), np.log1p(-objectness) + np.log(self.clutter_rate)
@@ -125,19 +123,17 @@ class Tracker:
             weights, null = np.zeros((n, m)), np.ones(n)
         assigned, weight = np.full(n, -1, dtype=np.int64), null.copy()
         best = np.argmax(weights, axis=1) if m else np.zeros(n, dtype=np.int64)
-        taken = np.zeros(m, dtype=bool)
         found = []
         for i in range(n):
             if m and weights[i, best[i]] > 0.5:
-                j = int(best[i])
-                taken[j] = True
-                self._update(j, position[i], covariance[i], latent[i], latent_variance[i], R_world_object[i],
+                track = int(best[i])
+                self._update(track, position[i], covariance[i], latent[i], latent_variance[i], R_world_object[i],
                              rotation_scale[i], frame)
-                assigned[i], weight[i] = self.index[j], weights[i, j]
+                assigned[i], weight[i] = self.index[track], weights[i, track]
             elif null[i] > 0.5 and objectness[i] > 0.05:
                 found.append(i)
         if found:
-            rows = np.array(found)
+            rows = np.array(found, dtype=np.int64)
             new = np.arange(self.total, self.total + len(rows))
             self.total += len(rows)
             assigned[rows] = new
@@ -206,9 +202,7 @@ def summarise_tracks(
     assigned: Int[np.ndarray, " k"],
     weight: Float[np.ndarray, " k"],
 ) -> Tracklets:
-    """First and last frame, length, and a motion test of every track; short tracks are dissolved, numbers are
-    repacked.
-    """
+    """First and last frame, length, and a motion test of every track; short tracks are dissolved, numbers are repacked."""
     table = problem.observations
     total = int(assigned.max(initial=-1)) + 1
     count = np.bincount(assigned[assigned >= 0], minlength=total)
@@ -232,9 +226,8 @@ def moving_tracks(
     """Tracks whose positions are explained much better by a constant velocity than by rest.
 
     The evidence is the fall of the weighted sum of squares when each coordinate is given a slope in time, less half a
-    log
-    of the sample size for each of the three slopes (BIC). Residuals are in the odometry frame; its drift over the track
-    is part of the variance.
+    log of the sample size for each of the three slopes (BIC). Residuals are in the odometry frame; its drift over the
+    track is part of the variance.
     """
     table = problem.observations
     rows = np.flatnonzero(assigned >= 0)
