@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 from nolbo_ppl.models.config import ModelConfig
@@ -75,7 +80,7 @@ def random_batch(
     cell = torch.stack([torch.randperm(cells, generator=g)[:slots] for _ in range(scenes)])
     corner = torch.stack((cell % columns, cell // columns), -1)
     centre = config.stride * (corner + uniform(0.2, 0.8, scenes, slots, 2))
-    half = uniform(5.0, 14.0, scenes, slots, 2)
+    half = torch.exp(uniform(math.log(5.0), math.log(32.0), scenes, slots, 2))
     present = (torch.arange(slots) < objects).expand(scenes, slots).clone()
     box = torch.cat((centre - half, centre + half), -1) * present[..., None]
     intrinsics = torch.tensor([FOCAL, FOCAL * 1.1, side / 2, side / 2 - 3]).double().expand(scenes, 4).clone()
@@ -118,9 +123,7 @@ def random_batch(
     )
 
 
-def random_posterior(
-    config: ModelConfig, shape: tuple[int, ...], seed: int = 0, near: Tensor | None = None
-) -> RegionParameters:
+def random_posterior(config: ModelConfig, shape: tuple[int, ...], seed: int = 0, near: Tensor | None = None) -> RegionParameters:
     """Random parameters of q(. | I); with `near` (viewpoints) the angles are narrow and close to them."""
     g = torch.Generator().manual_seed(seed)
 
@@ -186,9 +189,7 @@ def repeat_scene(scene: ObservedScene, count: int) -> ObservedScene:
         if isinstance(value, Tensor):
             return value.repeat(count, *(1,) * (value.dim() - 1))
         if dataclasses.is_dataclass(value):
-            return dataclasses.replace(
-                value, **{f.name: repeated(getattr(value, f.name)) for f in dataclasses.fields(value)}
-            )
+            return dataclasses.replace(value, **{f.name: repeated(getattr(value, f.name)) for f in dataclasses.fields(value)})
         return value
 
     return repeated(scene)
@@ -200,3 +201,22 @@ def assert_within(samples: Tensor, expected: Tensor | float, errors: float = 5.0
     bound = errors * samples.std(0) / math.sqrt(len(samples)) + slack
     difference = (samples.mean(0) - expected).abs()
     assert bool((difference <= bound).all()), f"off by {difference.max():.3e}, allowed {bound.min():.3e}"
+
+
+def run_in_two_processes(task: str, folder: Path) -> list[dict[str, Tensor]]:
+    """Run a task of `gloo_worker` in two gloo processes and return the tensors of each."""
+    worker = Path(__file__).with_name("gloo_worker.py")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    processes = []
+    for rank in range(2):
+        arguments = [task, str(rank), str(folder / "store"), str(folder / f"{rank}.safetensors")]
+        with (folder / f"{rank}.log").open("w") as log:
+            processes.append(subprocess.Popen([sys.executable, str(worker), *arguments], env=environment, stderr=log))
+    try:
+        codes = [process.wait(timeout=400) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert codes == [0, 0], "\n".join((folder / f"{rank}.log").read_text()[-2000:] for rank in range(2))
+    return [load_file(folder / f"{rank}.safetensors") for rank in range(2)]

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from nolbo_ppl.errors import InputError
+from nolbo_ppl.geometry.rotation import wrap_angle
 from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.nolbo import Nolbo
@@ -66,7 +67,7 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
         add("azimuth_natural", q.azimuth_natural[oriented])
         add("azimuth", batch.viewpoint[oriented][:, 0])
         add("order", batch.symmetry[oriented])
-        angle = (q.angle_loc - batch.viewpoint[..., 1:])[oriented] / q.angle_scale[oriented]
+        angle = wrap_angle(q.angle_loc - batch.viewpoint[..., 1:])[oriented] / q.angle_scale[oriented]
         add("angle", angle.square().sum(-1))
         box = (q.box_loc - where.box_target)[mask] / q.box_scale[mask]
         add("box", box.square().sum(-1))

@@ -113,6 +113,8 @@ class ObservationModel:
         single = (isinstance(images, np.ndarray) and images.ndim == 3) or (isinstance(images, Tensor) and images.dim() == 3)
         sequence: list[Any] = [images] if single else list(images)  # type: ignore[list-item]
         prepared = self._prepare_all(sequence, intrinsics)
+        if not 0 < threshold < 1:
+            raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
 
         def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor]:
             return self._detections(encoding, logit, threshold, iou_threshold)
@@ -299,9 +301,12 @@ class ObservationModel:
         self, q: RegionParameters, box: Tensor, box_scale: Tensor, position: Tensor, camera: Tensor
     ) -> Float[Tensor, "n 3 3"]:
         """Covariance of the position to first order: along the ray from the range, across it from the centre's pixel."""
-        spread = q.range_scale * q.range_scale.new_tensor(self.config.range_spread)
+        unit, loc = (q.range_loc.new_tensor(v) for v in (self.config.range_spread, self.config.range_loc))
+        spread, offset = q.range_scale * unit, q.range_loc * unit + loc
         extent = box[:, 2:] - box[:, :2]
-        pixel_variance = box_scale[:, :2].square() + (extent * spread[:, 1:3]).square()
+        # the centre's pixel = the box's centre + offset * extent: three independent errors an axis
+        relative = spread[:, 1:3].square() + (offset[:, 1:3] * box_scale[:, 2:]).square()
+        pixel_variance = box_scale[:, :2].square() + extent.square() * relative
         ray = position / torch.linalg.vector_norm(position, dim=-1, keepdim=True)
         along = position[:, :, None] * position[:, None, :] * spread[:, 0, None, None].square()
         depth = position[:, 2]
@@ -321,7 +326,9 @@ class ObservationModel:
         if not decode:
             extents = self._category_extents()[q.label_logits.argmax(-1)]
             return None, None, extents * diagonal.numpy()[:, None]
-        noise = np.random.default_rng(seed).standard_normal((samples, n, d))
+        if samples < 2:
+            raise input_error("samples of the shape latent", got=samples, expected="at least 2, for a variance")
+        noise = np.random.default_rng(seed).standard_normal((samples, 1, d))  # shared: the same answer in any company
         latent = q.shape_loc + q.shape_scale * torch.as_tensor(noise, dtype=q.shape_loc.dtype)
         occupancy = self.decode(latent.flatten(0, 1).numpy()).reshape(samples, n, *(self.config.voxel_size,) * 3)
         mean_shape = self.decode(q.shape_loc.numpy())

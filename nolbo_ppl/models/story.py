@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
 import pyro
@@ -150,7 +149,7 @@ class Story(nn.Module):
             return  # with other processes an empty batch goes through, for their normalisation waits for every one
         logits = self.decoder(latent.expand(*assigned.shape, -1).flatten(0, 1)[index])
         observed = unpack_bits(batch.voxels.flatten(0, 1)[index], self.config.voxel_size).to(logits.dtype)
-        voxel_site(logits, observed, total / max(len(index), 1))
+        voxel_site(logits, observed, total / len(index) if len(index) else 1.0)
 
 
 def _normal_expectation(observed: Tensor, scale: float) -> Callable[[dist.TorchDistribution], Tensor]:
@@ -204,6 +203,8 @@ def _teacher(batch: SceneBatch, assigned: Tensor, part: slice) -> dict[str, Any]
 
 def voxel_site(logits: Float[Tensor, "n v v v"], observed: Float[Tensor, "n v v v"], scale: float = 1.0) -> None:
     """Voxels of n decoded objects, independent Bernoulli; `scale` makes a subset stand for all."""
-    plate = pyro.plate("decoded", len(logits), dim=-1) if len(logits) else nullcontext()  # Pyro knows no empty plate
-    with plate, poutine.scale(scale=scale):
+    if len(logits) == 0:  # Pyro has no empty plates; the site keeps the decoder in the graph (see `Story._voxels`)
+        pyro.sample("voxels", dist.Bernoulli(logits=logits.flatten(), validate_args=False), obs=observed.flatten())
+        return
+    with pyro.plate("decoded", len(logits), dim=-1), poutine.scale(scale=scale):
         pyro.sample("voxels", dist.Bernoulli(logits=logits, validate_args=False).to_event(3), obs=observed)

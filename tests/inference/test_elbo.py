@@ -19,7 +19,16 @@ from torch import Tensor, nn
 from nolbo_ppl.errors import InputError, NolboError
 from nolbo_ppl.inference import elbo as module
 from nolbo_ppl.inference import optimisation
-from nolbo_ppl.inference.elbo import BOUND_TERMS, INCLUSIVE, PAPER, PURE_BOUND, ElboResult, SceneElbo, SceneLoss
+from nolbo_ppl.inference.elbo import (
+    BOUND_TERMS,
+    INCLUSIVE,
+    INCLUSIVE_TERMS,
+    PAPER,
+    PURE_BOUND,
+    ElboResult,
+    SceneElbo,
+    SceneLoss,
+)
 from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.nolbo import Nolbo
 from nolbo_ppl.models.scene import SceneBatch, unpack_bits
@@ -35,7 +44,7 @@ from tests.factories import (
 )
 
 FORMS = ("mixture", "angle", "sincos")
-EVERYTHING = {**PURE_BOUND, **INCLUSIVE, "objectness_inclusive": 1.0, "instance_inclusive": 1.0}
+EVERYTHING = {**PURE_BOUND, **dict.fromkeys(INCLUSIVE_TERMS.values(), 1.0), **dict.fromkeys(INCLUSIVE, 1.0)}
 
 
 @pytest.fixture(autouse=True)

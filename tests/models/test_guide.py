@@ -71,7 +71,8 @@ def test_observe_picks_the_predictor_with_the_highest_iou() -> None:
     """End to end: boxes decoded by hand from the head's own output of each cell."""
     config = tiny_config()
     model = tiny_model(config, scatter=0.3).eval()
-    batch = random_batch(config, 4, 3, objects=2, seed=2)
+    batch = random_batch(config, 4, 4, objects=3, seed=2)
+    batch.box[0, 0] = torch.tensor([-10.0, -10, 70, 70])
     scene = model.guide.observe(batch)
     where = scene.assignment
     assert torch.equal(where.assigned, batch.present)
@@ -91,7 +92,7 @@ def test_observe_picks_the_predictor_with_the_highest_iou() -> None:
         assert bool(where.is_object[b, region])
         torch.testing.assert_close(scene.posterior.range_loc[b, m], rows[best].range_loc[0])
         torch.testing.assert_close(scene.posterior.shape_scale[b, m], rows[best].shape_scale[0])
-    assert int(where.is_object.sum()) == 8
+    assert int(where.is_object.sum()) == 12
     assert chosen == {0, 1}, "both predictors are chosen somewhere"
 
 

@@ -35,14 +35,20 @@ def test_outputs_are_split_without_gap_or_overlap() -> None:
     assert sorted(everything) == list(range(sum(head.sizes)))
 
 
-def test_start_of_the_azimuth_modes() -> None:
-    config = tiny_config(azimuth_components=4)
+def test_start_of_the_azimuth_modes_and_of_the_boxes() -> None:
+    """Features that say nothing: modes a quarter turn apart, and predictors of different sizes."""
+    config = tiny_config(azimuth_components=4, predictors=3)
     head = RegionHead(10, config).double()
-    q = head.parameters_of(torch.zeros(sum(head.sizes)), torch.zeros(4, config.latent_dim))
-    angle = torch.atan2(q.azimuth_natural[:, 1], q.azimuth_natural[:, 0])
-    turned = torch.remainder(angle - torch.arange(4) * (math.pi / 2) + math.pi, 2 * math.pi) - math.pi
-    torch.testing.assert_close(turned, torch.zeros(4), atol=1e-6, rtol=0)
-    torch.testing.assert_close(q.azimuth_natural.norm(dim=-1), torch.ones(4), atol=1e-7, rtol=0)
+    torch.nn.init.zeros_(head.outputs[-1].weight)
+    torch.nn.init.zeros_(head.outputs[-1].bias)
+    q = head.parameters_of(head(torch.randn(10)), torch.zeros(4, config.latent_dim))
+    angle = torch.atan2(q.azimuth_natural[..., 1], q.azimuth_natural[..., 0])
+    expected = torch.arange(4) * (math.pi / 2)
+    torch.testing.assert_close(angle.cos(), expected.cos().expand(3, 4), atol=1e-6, rtol=0)
+    torch.testing.assert_close(angle.sin(), expected.sin().expand(3, 4), atol=1e-6, rtol=0)
+    torch.testing.assert_close(q.azimuth_natural.norm(dim=-1), torch.ones(3, 4), atol=1e-6, rtol=0)
+    assert torch.equal(q.box_loc, torch.tensor([[0.0, 0, -1, -1], [0, 0, 0, 0], [0, 0, 1, 1]]))
+    assert bool((q.shape_loc == 0).all())
 
 
 def test_shape_mean_is_the_expected_prior_mean_plus_a_residual() -> None:
@@ -85,6 +91,6 @@ def test_map_touches_every_parameter() -> None:
 
 def test_objectness_starts_low() -> None:
     """A scene is mostly background: the bias keeps the first steps from drowning in it."""
-    model = tiny_model().eval()
+    model = tiny_model().eval().requires_grad_(False)
     logit = model.guide.encode(torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)).objectness_logit
     assert float(logit.mean()) < -3

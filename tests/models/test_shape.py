@@ -57,7 +57,7 @@ def test_priors_start_far_apart() -> None:
     distance = torch.stack(
         [torch.pdist(LabelPrior(tiny_config(latent_dim=16, prior_width=64)).category_mean()).min() for _ in range(20)]
     )
-    assert float(distance.median()) > 2
+    assert float(distance.detach().median()) > 2
 
 
 def test_decoder_doubles_a_dense_grid() -> None:
