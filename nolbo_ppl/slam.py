@@ -28,6 +28,8 @@ class SlamArguments:
     """Folder for trajectory.txt, landmarks.json, associations.jsonl, summary.json and map.png."""
     truth: Path | None = None
     """True trajectory, for errors before and after: rows of the odometry, or TUM rows matched by time."""
+    model: str | None = None
+    """Model (a name or a folder) that decodes the landmarks' latents into landmarks_voxels.npz."""
     online: bool = False
     """Run keyframe by keyframe on iSAM2."""
     config: SlamConfig = field(default_factory=SlamConfig)
@@ -66,13 +68,18 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     table = read_observations(arguments.observations, frames=len(odometry))
     truth = None if arguments.truth is None else matched_truth(odometry, arguments.truth)
     problem = SlamProblem(odometry.T_world_camera, table)
+    model = None
+    if arguments.model is not None:
+        from nolbo_ppl.inference.weights import load
+
+        model = load(arguments.model)  # before the solve: a wrong name should not cost a run
     if arguments.online:
         from nolbo_ppl.inference.slam.online import solve_online
 
         result = solve_online(problem, arguments.config)
     else:
         result = solve(problem, arguments.config)
-    return result, write_result(arguments.out, result, odometry, truth)
+    return result, write_result(arguments.out, result, odometry, truth, model=model)
 
 
 def describe(report: dict[str, object]) -> str:

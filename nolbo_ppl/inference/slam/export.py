@@ -14,6 +14,7 @@ import numpy as np
 from nolbo_ppl.data.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
 from nolbo_ppl.inference.slam.result import Landmark, SlamResult
+from nolbo_ppl.inference.slam.shapes import LatentDecoder, write_voxels
 from nolbo_ppl.io import write_json, write_jsonl
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, relative_pose_error
 
@@ -123,6 +124,7 @@ def write_result(
     odometry: Trajectory,
     truth: np.ndarray | None = None,
     picture: bool = True,
+    model: LatentDecoder | None = None,
 ) -> dict[str, Any]:
     """Write every file into `out`, each atomically, the summary last; returns the summary.
 
@@ -132,8 +134,14 @@ def write_result(
         odometry: the input, for its format and times.
         truth: true poses of the same rows, for errors and the picture.
         picture: draw `map.png`.
+        model: decodes the landmarks' latents into `landmarks_voxels.npz`.
+
+    Raises:
+        InputError: the latents do not have the model's dimension; nothing is written.
     """
     out = Path(out)
+    if model is not None:
+        write_voxels(out / "landmarks_voxels.npz", result.decode_landmarks(model))
     write_trajectory(out / "trajectory.txt", Trajectory(result.T_world_camera, odometry.times, odometry.format))
     write_json(out / "landmarks.json", [landmark_row(landmark) for landmark in result.landmarks])
     write_jsonl(out / "associations.jsonl", association_rows(result))

@@ -16,6 +16,7 @@ from nolbo_ppl.inference.slam.finish import final_graph
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import Linearisation, linearise
 from nolbo_ppl.inference.slam.observe import Associations
+from nolbo_ppl.inference.slam.shapes import LatentDecoder, Voxels, decode_landmarks
 from nolbo_ppl.inference.slam.state_types import SlamState
 
 
@@ -125,6 +126,10 @@ class SlamResult:
                 )
             )
         return tuple(out)
+
+    def decode_landmarks(self, model: LatentDecoder, samples: int = 8, seed: int = 0) -> dict[str, Voxels]:
+        """Mean and variance of the voxels of every landmark that has a latent (see `shapes.decode_landmarks`)."""
+        return decode_landmarks(self.landmarks, model, samples=samples, seed=seed)
 
     def _sizes(self) -> list[np.ndarray | None]:
         table, state = self.state.problem.observations, self.state
