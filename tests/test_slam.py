@@ -11,7 +11,10 @@ import pytest
 from nolbo_ppl.data.observations import write_observations
 from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
+from nolbo_ppl.inference.weights import save
+from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.slam import main
+from tests.factories import tiny_model
 
 
 @pytest.fixture(scope="module")
@@ -39,16 +42,20 @@ def arguments(folder: Path, out: Path, **change: str) -> list[str]:
 
 
 def test_every_file_is_written(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main([*arguments(folder, tmp_path, truth=str(folder / "truth.txt")), "--config.em-iterations", "2"])
+    save(folder / "model", tiny_model().float(), Calibration(), {})
+    main([*arguments(folder, tmp_path, truth=str(folder / "truth.txt"), model=str(folder / "model")),
+          "--config.em-iterations", "2"])
     assert "ATE" in capsys.readouterr().out
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "associations.jsonl", "landmarks.json", "map.png", "summary.json", "trajectory.txt"]
+        "associations.jsonl", "landmarks.json", "landmarks_voxels.npz", "map.png", "summary.json", "trajectory.txt"]
     back = read_trajectory(tmp_path / "trajectory.txt")
     assert back.format == "tum" and len(back) == 120 and back.times is not None and back.times[0] == 100.0
     ids = [json.loads(line)["id"] for line in (folder / "observations.jsonl").read_text().splitlines()]
     rows = [json.loads(line) for line in (tmp_path / "associations.jsonl").read_text().splitlines()]
     assert [row["id"] for row in rows] == ids
     names = {landmark["name"] for landmark in json.loads((tmp_path / "landmarks.json").read_text())}
+    with np.load(tmp_path / "landmarks_voxels.npz", allow_pickle=False) as voxels:
+        assert set(voxels.files) == {f"{name}/{part}" for name in names for part in ("mean", "variance")}
     for row in rows:
         assert set(row["landmarks"]) <= names
         assert sum(row["landmarks"].values()) + row["new"] + row["background"] == pytest.approx(1.0, abs=5e-3)
