@@ -71,7 +71,7 @@ def test_paper_decoder_makes_64_cubed() -> None:
     torch.set_default_dtype(torch.float32)
     config = paper()
     assert config.decoder_channels == (512, 256, 128, 64)
-    small = tiny_config(voxel_size=64, decoder_channels=(8, 6, 4, 2))
+    small = tiny_config(voxel_size=64, decoder_channels=(8, 6, 4, 2), voxel_encoder_channels=(4, 4, 4, 8))
     with torch.no_grad():
         assert VoxelDecoder(small).eval()(torch.zeros(2, 4)).shape == (2, 64, 64, 64)
     with torch.device("meta"):
