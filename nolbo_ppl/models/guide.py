@@ -112,7 +112,7 @@ class Guide(nn.Module):
     def observe(self, batch: SceneBatch) -> ObservedScene:
         """Encode a batch and find the responsible region of each object."""
         encoding = self.encode(batch.image)
-        batch = batch.neutral()
+        batch = self._prior().complete(batch.neutral())
         stride, columns = self.config.stride, encoding.columns
         cell = cell_of(batch.box, encoding.rows, columns, stride)
         raw = self._raw(encoding, cell)

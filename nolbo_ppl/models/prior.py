@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.scene import SceneBatch
 from nolbo_ppl.models.shape import PriorNetwork
 
 
@@ -45,6 +46,13 @@ class LabelPrior(nn.Module):
         """Prior mean of the whole latent by category; the instance half of an unknown instance is zero."""
         mean = self.category_mean()
         return torch.cat((mean, mean.new_zeros(self.labels, self.instance_dim)), -1) if self.instance_dim else mean
+
+    def complete(self, batch: SceneBatch) -> SceneBatch:
+        """A known instance tells its category where that is missing."""
+        if self.instance is None:
+            return batch
+        told = self.instance_category[batch.instance.clamp_min(0)]
+        return batch.replace(category=torch.where((batch.category < 0) & (batch.instance >= 0), told, batch.category))
 
     def instance_log_probability(self, label: Int[Tensor, "*n"]) -> Float[Tensor, "*n instances"]:
         """log p(i | l), "novel" last."""

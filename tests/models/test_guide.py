@@ -11,7 +11,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.models.guide import assign_predictors, orientation_posterior
 from nolbo_ppl.models.scene import cell_of, decode_box
-from tests.factories import random_batch, random_posterior, tiny_config, tiny_model
+from tests.factories import instance_config, random_batch, random_posterior, tiny_config, tiny_model
 
 
 def greedy(cell: list[int], iou: torch.Tensor, present: list[bool]) -> dict[int, int]:
@@ -107,6 +107,15 @@ def test_encoding_lays_regions_out_row_by_row() -> None:
     logits = model.guide.head.objectness(maps[0].permute(1, 2, 0))
     torch.testing.assert_close(encoding.objectness_logit[0], logits.flatten())
     torch.testing.assert_close(encoding.features[0, 1 * 6 + 4], maps[0, :, 1, 4])
+
+
+def test_a_known_instance_tells_its_category() -> None:
+    config = instance_config()
+    batch = random_batch(config, 1, 4)
+    batch.category[0] = torch.tensor([-1, -1, 0, 2])
+    batch.instance[0] = torch.tensor([2, -1, -1, 3])
+    scene = tiny_model(config).eval().guide.observe(batch)
+    assert scene.batch.category.tolist() == [[2, -1, 0, 2]]
 
 
 def test_half_precision_comes_back_in_full() -> None:
