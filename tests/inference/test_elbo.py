@@ -181,9 +181,7 @@ def test_the_azimuth_of_a_free_axis_is_ignored(form: str, weights: dict[str, flo
     q = observed_scene(config, batch).posterior
     found = []
     for turn in (0.0, 1.1):
-        scene = observed_scene(
-            config, batch, dataclasses.replace(q, azimuth_natural=q.azimuth_natural.requires_grad_())
-        )
+        scene = observed_scene(config, batch, dataclasses.replace(q, azimuth_natural=q.azimuth_natural.requires_grad_()))
         scene.batch.viewpoint[..., 0] += turn
         result = SceneElbo(weights).evaluate(model.story, model.guide, scene, decode=0)
         (gradient,) = torch.autograd.grad(result.loss, q.azimuth_natural, allow_unused=True)
@@ -496,7 +494,9 @@ def test_inclusive_optimum_is_the_exact_posterior() -> None:
         elbo = SceneElbo({"orientation_inclusive": 1.0, "box_inclusive": 1.0})
         return elbo.evaluate(model.story, model.guide, dataclasses.replace(scene, posterior=posterior), decode=0)
 
-    optimiser = torch.optim.LBFGS(free.parameters(), max_iter=500, tolerance_grad=1e-10, tolerance_change=1e-15, line_search_fn="strong_wolfe")
+    optimiser = torch.optim.LBFGS(
+        free.parameters(), max_iter=500, tolerance_grad=1e-10, tolerance_change=1e-15, line_search_fn="strong_wolfe"
+    )
 
     def closure() -> Tensor:
         optimiser.zero_grad()
