@@ -12,6 +12,11 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
 
+LEAST_CONCENTRATION = 0.1
+"""Concentrations below this leave the azimuth open; the scale of a mode grows no further."""
+LEAST_WEIGHT = 1e-3
+"""Orientation modes of less weight are left out of files."""
+
 
 @dataclass(frozen=True)
 class ViewpointModes:
@@ -23,6 +28,18 @@ class ViewpointModes:
     """Mean direction of each mode, rad."""
     concentration: Float[np.ndarray, "n modes"]
     """Concentration of each mode; the scale in rad is about 1 / sqrt(concentration)."""
+
+
+@dataclass(frozen=True)
+class RotationModes:
+    """Orientation posterior of n objects as K egocentric rotations: the azimuth's modes turned into the camera's frame."""
+
+    weights: Float[np.ndarray, "n modes"]
+    """Weight of each mode."""
+    R_camera_object: Float[np.ndarray, "n modes 3 3"]
+    """Rotation at the mode's azimuth and the mean elevation and in-plane rotation."""
+    scale: Float[np.ndarray, "n modes"]
+    """Scale of the rotation about the mode, rad: root mean square over the three angles' scales."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +127,24 @@ class Observations:
         vertices, faces = voxels_to_mesh(self.voxel_mean[index])
         return vertices * (self.diagonal[index] if metric else 1.0), faces
 
+    def rotation_modes(self) -> RotationModes:
+        """Every azimuth mode as an egocentric rotation: the guide's angles are seen along the ray through the object, so each
+        mode is turned by the smallest rotation from the optical axis to that ray (method section 0).
+        """
+        import torch
+
+        from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix  # torch is only needed here
+
+        azimuth = np.asarray(self.viewpoint_modes.azimuth, dtype=np.float64)
+        tilt = np.broadcast_to(np.asarray(self.elevation_inplane, dtype=np.float64)[:, None], (*azimuth.shape, 2))
+        viewpoint = torch.from_numpy(np.concatenate([azimuth[..., None], tilt], axis=-1))
+        ray = torch.from_numpy(np.asarray(self.position, dtype=np.float64))[:, None].expand(*azimuth.shape, 3)
+        R = allocentric_to_egocentric(viewpoint_to_matrix(viewpoint), ray).numpy()
+        variance = 1.0 / np.maximum(np.asarray(self.viewpoint_modes.concentration, dtype=np.float64), LEAST_CONCENTRATION)
+        tilt_variance = (np.asarray(self.elevation_inplane_scale, dtype=np.float64) ** 2).sum(axis=-1, keepdims=True)
+        weights = np.asarray(self.viewpoint_modes.weights, dtype=np.float64)
+        return RotationModes(weights, R, np.sqrt((variance + tilt_variance) / 3))
+
     def rows(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
         """One JSON-able dictionary an object, the lines of `observations.jsonl` (the format SLAM reads)."""
         import torch
@@ -117,6 +152,8 @@ class Observations:
         from nolbo_ppl.geometry.rotation import matrix_to_quaternion  # torch is only needed here
 
         quaternion = matrix_to_quaternion(torch.from_numpy(np.array(self.R_camera_object, dtype=np.float64))).numpy()
+        modes = self.rotation_modes()
+        mode_quaternion = matrix_to_quaternion(torch.from_numpy(modes.R_camera_object)).numpy()
         for i, category in enumerate(self.category):
             yield {
                 "frame": frame,
@@ -130,6 +167,11 @@ class Observations:
                 "position_cov": [_rounded(row, 9) for row in self.position_covariance[i]],
                 "rotation": _rounded(quaternion[i], 8),
                 "rotation_std": round(float(self.rotation_scale[i]), 5),
+                "rotation_modes": [
+                    {"weight": round(float(w), 5), "rotation": _rounded(q, 8), "std": round(float(s), 5)}
+                    for w, q, s in zip(modes.weights[i], mode_quaternion[i], modes.scale[i])
+                    if w >= LEAST_WEIGHT
+                ],
                 "viewpoint": _rounded(self.viewpoint[i], 5),
                 "azimuth_modes": [
                     {"weight": round(float(w), 5), "azimuth": round(float(a), 5), "concentration": round(float(k), 3)}
