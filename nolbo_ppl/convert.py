@@ -1,4 +1,4 @@
-"""`nolbo convert`: public data sets into odometry, truth and observations for `nolbo slam`."""
+"""`nolbo convert`: public data sets into odometry, truth and observations for `nolbo slam`, or scenes for `nolbo evaluate`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,28 @@ import tyro
 
 from nolbo_ppl.data.convert import (
     Converted,
+    convert_kitti_object,
     convert_kitti_poles,
     convert_kitti_tracking,
     convert_ycbv_slam,
     write_converted,
 )
 from nolbo_ppl.errors import NolboError
+
+
+@dataclass(frozen=True)
+class KittiObject:
+    """KITTI object detection: street images with 3D boxes of cars, as scenes for `nolbo evaluate`."""
+
+    data: Path
+    """Folder `kitti_object` with image_2/, label_2/ and calib/."""
+    out: Path
+    """Folder for images/, scenes.jsonl, source.json."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        counts = convert_kitti_object(self.data, self.out)
+        return f"{counts['images']} images, {counts['objects']} cars, {counts['ignore']} regions to ignore"
 
 
 @dataclass(frozen=True)
@@ -108,7 +124,8 @@ class YcbvSlam:
 
 
 Source = (
-    Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
+    Annotated[KittiObject, tyro.conf.subcommand("kitti-object")]
+    | Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
     | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
     | Annotated[YcbvSlam, tyro.conf.subcommand("ycbv-slam")]
 )
@@ -116,14 +133,19 @@ Source = (
 
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
-    source: KittiPoles | KittiTracking | YcbvSlam = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
+    source: KittiObject | KittiPoles | KittiTracking | YcbvSlam
+    source = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
     try:
-        data = source.convert()
-        write_converted(source.out, data)
+        if isinstance(source, KittiObject):
+            written = source.write()
+        else:
+            data = source.convert()
+            write_converted(source.out, data)
+            written = f"{len(data.odometry)} frames, {len(data.observations)} observations"
     except NolboError as error:
         sys.stderr.write(f"error: {error}\n")
         raise SystemExit(1) from None
-    sys.stdout.write(f"{len(data.odometry)} frames, {len(data.observations)} observations written to {source.out}\n")
+    sys.stdout.write(f"{written} written to {source.out}\n")
 
 
 if __name__ == "__main__":

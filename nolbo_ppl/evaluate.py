@@ -20,6 +20,7 @@ from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.truth import FolderScenes, GeneratedScenes, Scenes
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.measure import measure_detections, measure_objects
+from nolbo_ppl.inference.pyramid import Pyramid
 from nolbo_ppl.inference.queries import ObservationModel
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import write_json
@@ -59,6 +60,13 @@ class EvaluateConfig:
     """Folder of CAD shapes to generate scenes from, in place of parametric ones."""
     backgrounds: Path | None = None
     """Folder of photographs behind generated scenes."""
+    sizes: tuple[int, ...] = ()
+    """Longer sides, px, images are brought to; the network's own size by default. With several, each answers for the
+    objects it shows at a trained size: `320 960` for street images 1242 px wide."""
+    retrieval: bool = False
+    """Measure too whether the shape latent tells instances of a category apart, from other views in other light."""
+    gallery: int = 100
+    """Instances of each category among which one is to be found again."""
     least_side: float = 12.0
     """Objects whose box has no side of so many px do not count, nor does a detection of them."""
     least_visibility: float = 0.5
@@ -109,14 +117,14 @@ class Evaluation:
     categories: tuple[str, ...]
 
 
-def measure(config: EvaluateConfig, model: ObservationModel, scenes: Scenes) -> Evaluation:
+def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: Scenes) -> Evaluation:
     """Run the model over the scenes and compute every figure.
 
     Raises:
         InputError: no scene holds an object that counts.
     """
     objects: list[ObjectRecords] = []
-    boxes, labels, counts, answers = [], [], [], []
+    boxes, labels, counts, answers, regions = [], [], [], [], []
     for start in tqdm(range(0, len(scenes), config.batch), desc="evaluating", unit="batch", disable=None):
         rows = range(start, min(start + config.batch, len(scenes)))
         truth = [scenes[i] for i in rows]
@@ -127,6 +135,7 @@ def measure(config: EvaluateConfig, model: ObservationModel, scenes: Scenes) -> 
         boxes += [scene.box for scene in truth]
         labels += [scene.category for scene in truth]
         counts += counted
+        regions += [scene.ignore for scene in truth]
         used = [k for k, some in enumerate(counted) if some.any()]
         if used:
             slots = [np.flatnonzero(counted[k]) for k in used]
@@ -142,7 +151,7 @@ def measure(config: EvaluateConfig, model: ObservationModel, scenes: Scenes) -> 
         )  # fmt: skip
     categories = model.config.categories
     records = concatenate(objects)
-    detections = measure_detections(boxes, labels, counts, answers, len(categories))
+    detections = measure_detections(boxes, labels, counts, answers, len(categories), regions=regions)
     rng = np.random.default_rng(config.seed)
     estimates = figures(records, detections, len(scenes), model.config.symmetry, rng, config.resamples)
     return Evaluation(records, detections, estimates, len(scenes), categories)
@@ -189,7 +198,9 @@ def _number(value: float | None) -> str:
 
 def run(config: EvaluateConfig) -> Evaluation:
     """Measure the model and write `metrics.json` and, unless switched off, the plots and examples into `config.out`."""
-    model = load(config.model)
+    model: ObservationModel | Pyramid = load(config.model)
+    if config.sizes:
+        model = Pyramid(model, config.sizes)
     scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
     write_json(config.out / "metrics.json", metrics(evaluation, config))

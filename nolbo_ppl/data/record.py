@@ -50,6 +50,8 @@ class SceneRecord:
     image: Path
     intrinsics: Float[np.ndarray, " 4"]
     objects: tuple[ObjectRecord, ...]
+    ignore: Float[np.ndarray, "k 4"]
+    """Boxes of parts of the image whose objects are not labelled: what is found there is not judged."""
 
 
 def record_of(rendered: Rendered, image: str) -> dict[str, Any]:
@@ -103,6 +105,7 @@ class _Line:
 
 
 def _parse_box(at: _Line, row: dict[str, Any], where: str, width: int, height: int) -> np.ndarray:
+    """A box inside the image."""
     box = at.numbers(row, "box", where, 4, "[x0, y0, x1, y1] in px")
     if box[0] >= box[2] or box[1] >= box[3]:
         raise at.error(f"{where}box", box.tolist(), "x0 < x1 and y0 < y1")
@@ -183,7 +186,11 @@ def parse_record(
     if not isinstance(objects, list):
         raise at.error("objects", objects, "a list of objects (empty when there is none)")
     parsed = [_parse_object(at, thing, k, *image_size, categories) for k, thing in enumerate(objects)]
-    return SceneRecord(image, intrinsics, tuple(parsed))
+    regions = [] if row.get("ignore") is None else row["ignore"]
+    if not isinstance(regions, list):
+        raise at.error("ignore", regions, "a list of boxes [x0, y0, x1, y1] in px")
+    ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
+    return SceneRecord(image, intrinsics, tuple(parsed), np.array(ignore, dtype=np.float64).reshape(-1, 4))
 
 
 def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Path:

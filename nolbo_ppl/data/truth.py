@@ -54,6 +54,8 @@ def truth_of_rendered(rendered: Rendered, categories: Sequence[str]) -> SceneTru
         symmetry=np.array([label.symmetry for label in labels], dtype=np.int64),
         visibility=np.array([label.visibility for label in labels], dtype=np.float64),
         voxels=np.array([label.item.voxels for label in labels], dtype=np.uint8).reshape(n, -1 if n else 0),
+        diagonal=np.array([label.size for label in labels], dtype=np.float64),
+        ignore=np.zeros((0, 4)),
     )
 
 
@@ -89,4 +91,6 @@ class FolderScenes:
             symmetry=np.array([thing.symmetry for thing in objects], dtype=np.int64),
             visibility=np.array([thing.visibility for thing in objects], dtype=np.float64),
             voxels=arrays["voxels"][0, :n],
+            diagonal=np.array([np.nan if thing.size is None else thing.size for thing in objects], dtype=np.float64),
+            ignore=record.ignore,
         )

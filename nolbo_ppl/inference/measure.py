@@ -50,6 +50,10 @@ class SceneTruth:
     """Visible share."""
     voxels: UInt8[np.ndarray, "m bytes"]
     """Canonical grid, packed bits in C order; all zero where it is unknown."""
+    diagonal: Float[np.ndarray, " m"]
+    """Box diagonal, m."""
+    ignore: Float[np.ndarray, "k 4"]
+    """Boxes of parts of the image whose objects are not labelled, px."""
 
     @property
     def side(self) -> Float[np.ndarray, " m"]:
@@ -113,6 +117,7 @@ def measure_objects(
     error[oriented] = rotation_error(said("R_camera_object")[oriented], R_truth[oriented], symmetry[oriented])
     tilt = _wrap(viewpoint[:, 1:] - said("elevation_inplane"))
     distance = np.linalg.norm(position, axis=1)
+    depth = said("position")[:, 2]
     return ObjectRecords(
         scene=np.repeat(np.asarray(scenes), [len(rows) for rows in slots]),
         slot=np.concatenate([np.asarray(rows) for rows in slots]),
@@ -126,6 +131,9 @@ def measure_objects(
         tilt_mass=chi_square_mass(tilt, said("elevation_inplane_scale") ** 2),
         position_mass=chi_square_mass(position - said("position"), said("position_covariance")),
         range_error=np.abs(np.linalg.norm(said("position"), axis=1) / distance - 1),
+        depth_error=np.abs(depth / position[:, 2] - 1),
+        # An image shows the ratio of distance and size: the true size takes the place of the estimated one.
+        sized_depth_error=np.abs(depth * true("diagonal") / said("diagonal") / position[:, 2] - 1),
         azimuth_error=np.where(symmetry == 1, _wrap(said("viewpoint")[:, 0] - viewpoint[:, 0]), np.nan),
         **orientation,
         **shape,
@@ -235,6 +243,7 @@ def measure_detections(
     answers: Sequence[tuple[Float[np.ndarray, "_ 4"], Float[np.ndarray, " _"], Float[np.ndarray, "_ labels"]]],
     labels: int,
     iou_threshold: float = 0.5,
+    regions: Sequence[Float[np.ndarray, "_ 4"]] | None = None,
 ) -> DetectionRecords:
     """Match everything a model found, as objects of any category and category by category.
 
@@ -245,9 +254,10 @@ def measure_detections(
         answers: boxes, objectness and class posterior of the detections of each scene.
         labels: number of categories.
         iou_threshold: least overlap of a match.
+        regions: parts of each scene where detections are not judged.
     """
     boxes, objectness = [box for box, _, _ in answers], [score for _, score, _ in answers]
-    found = match(boxes, objectness, truth_boxes, [~c for c in counts], iou_threshold)
+    found = match(boxes, objectness, truth_boxes, [~c for c in counts], iou_threshold, regions)
     best = [posterior.argmax(1) if len(posterior) else np.empty(0, dtype=int) for _, _, posterior in answers]
     score = [o * (p.max(1) if len(p) else 1.0) for _, o, p in answers]
 
@@ -258,7 +268,7 @@ def measure_detections(
         ignore = [(~n | (c < 0))[k] for n, c, k in zip(counts, truth_categories, concerned)]
         return match(
             [b[k] for b, k in zip(boxes, own)], [s[k] for s, k in zip(score, own)],
-            [t[k] for t, k in zip(truth_boxes, concerned)], ignore, iou_threshold,
+            [t[k] for t, k in zip(truth_boxes, concerned)], ignore, iou_threshold, regions,
         )  # fmt: skip
 
     return DetectionRecords(found, tuple(of(label) for label in range(labels)))

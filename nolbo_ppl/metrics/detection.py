@@ -26,7 +26,7 @@ class Matches:
     truth: Int[np.ndarray, " n"]
     """Row of the truth it is matched to, among those of its image; -1 for none."""
     ignored: Bool[np.ndarray, " n"]
-    """Matched to an ignored truth: counts neither for nor against."""
+    """Matched to an ignored truth, or unmatched in a region to ignore: counts neither for nor against."""
     truths: Int[np.ndarray, " scenes"]
     """Number of truths to be found in each image, ignored ones left out."""
 
@@ -88,14 +88,37 @@ def match_image(
     return matched
 
 
+def in_regions(
+    box: Float[np.ndarray, "n 4"], region: Float[np.ndarray, "k 4"], share: float = 0.5
+) -> Bool[np.ndarray, " n"]:
+    """Whether at least `share` of a box lies in one of the regions: a region may hold several objects, so that the overlap
+    is measured against the box alone, as COCO does for crowds and KITTI for its DontCare regions.
+    """
+    box, region = np.asarray(box, dtype=np.float64).reshape(-1, 4), np.asarray(region, dtype=np.float64).reshape(-1, 4)
+    low = np.maximum(box[:, None, :2], region[None, :, :2])
+    high = np.minimum(box[:, None, 2:], region[None, :, 2:])
+    covered = np.prod(np.clip(high - low, 0, None), axis=-1)
+    area = np.prod(np.clip(box[:, 2:] - box[:, :2], 0, None), axis=-1)
+    return (covered >= share * area[:, None]).any(1) & (area > 0)
+
+
 def match(
     boxes: Sequence[Float[np.ndarray, "_ 4"]],
     scores: Sequence[Float[np.ndarray, " _"]],
     truth_boxes: Sequence[Float[np.ndarray, "_ 4"]],
     ignores: Sequence[Bool[np.ndarray, " _"]],
     iou_threshold: float = 0.5,
+    regions: Sequence[Float[np.ndarray, "_ 4"]] | None = None,
 ) -> Matches:
     """Match the detections of every image and put them in the order of their scores (one entry an image in each list).
+
+    Args:
+        boxes: boxes of the detections.
+        scores: their scores.
+        truth_boxes: boxes of the truths.
+        ignores: truths that do not count.
+        iou_threshold: least overlap of a match.
+        regions: boxes of parts of the images whose content is not labelled, if there are any.
 
     Raises:
         InputError: the lists differ in length, or as `match_image`.
@@ -105,6 +128,12 @@ def match(
         raise input_error("lists of images", got=sorted(lengths), expected="one entry an image in each")
     found = [match_image(*image, iou_threshold) for image in zip(boxes, scores, truth_boxes, ignores)]
     ignored = [np.asarray(flag, dtype=bool)[m] & (m >= 0) if len(flag) else m >= 0 for m, flag in zip(found, ignores)]
+    if regions is not None:
+        if len(regions) != len(found):
+            raise input_error("regions to ignore", got=f"{len(regions)} lists", expected=f"one for each of {len(found)} images")
+        ignored = [
+            flag | ((m < 0) & in_regions(box, part)) for flag, m, box, part in zip(ignored, found, boxes, regions)
+        ]
     sizes = [len(m) for m in found]
     scene = np.repeat(np.arange(len(found)), sizes)
     score = _join(scores, np.float64)

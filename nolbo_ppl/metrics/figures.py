@@ -22,7 +22,7 @@ from nolbo_ppl.metrics.statistics import Weights, by_group, mean_of_defined, wei
 from nolbo_ppl.metrics.viewpoint import ACCURATE
 
 REQUIRED = (
-    "ap50", "category_accuracy", "acc_pi6", "med_err_deg", "acc_pi6_all", "voxel_iou", "voxel_iou_gain", "voxel_ap",
+    "ap50", "map50", "category_accuracy", "acc_pi6", "med_err_deg", "acc_pi6_all", "voxel_iou", "voxel_iou_gain", "voxel_ap",
     "ece_objectness", "ece_class", "coverage90_orientation", "coverage90_position", "coverage90_latent",
 )  # fmt: skip
 """The figures every evaluation reports."""
@@ -68,6 +68,10 @@ class ObjectRecords:
     """Mass of the region of the position that reaches to the truth."""
     range_error: Float[np.ndarray, " n"]
     """Relative error of the distance, absolute value."""
+    depth_error: Float[np.ndarray, " n"]
+    """Relative error of the depth (along the optical axis), absolute value."""
+    sized_depth_error: Float[np.ndarray, " n"]
+    """The same, of the depth that follows when the object's true size is told."""
     latent_mass: Float[np.ndarray, " n"]
     """Mass of the region of the shape latent that reaches to the mean the shape autoencoder gives the true shape."""
     voxel_iou: Float[np.ndarray, " n"]
@@ -155,6 +159,7 @@ def figures(
         "acc_pi6": over_categories(accurate, plain),
         "med_err_deg": over_categories(degrees, plain, weighted_median),
         "acc_pi6_all": over_categories(accurate, everything),
+        "azimuth_acc_pi6": pooled(accurate_azimuth(objects), proportion=True),
         "voxel_iou": pooled(objects.voxel_iou),
         "voxel_iou_gain": pooled(objects.voxel_iou - objects.category_iou),
         "voxel_iou_ceiling": pooled(objects.teacher_iou),
@@ -168,6 +173,8 @@ def figures(
         "azimuth_log_score": pooled(-objects.azimuth_log_density),
         "azimuth_crps_deg": pooled(np.degrees(objects.azimuth_crps)),
         "median_range_error": pooled(objects.range_error, median=True),
+        "median_depth_error": pooled(objects.depth_error, median=True),
+        "median_depth_error_known_size": pooled(objects.sized_depth_error, median=True),
     }
     assert set(REQUIRED) <= set(result)
     return result
@@ -176,6 +183,12 @@ def figures(
 def accurate_viewpoint(objects: ObjectRecords) -> Float[np.ndarray, " n"]:
     """1 where the viewpoint is within pi/6, 0 where it is not, NaN without a true one."""
     return np.where(np.isfinite(objects.rotation_error), objects.rotation_error < ACCURATE, np.nan)
+
+
+def accurate_azimuth(objects: ObjectRecords) -> Float[np.ndarray, " n"]:
+    """1 where the azimuth alone is within pi/6, 0 where it is not, NaN for symmetric objects and without a true one."""
+    error = np.abs(objects.azimuth_error)
+    return np.where(np.isfinite(error), error < ACCURATE, np.nan)
 
 
 def right_category(objects: ObjectRecords) -> Float[np.ndarray, " n"]:
@@ -263,6 +276,7 @@ def summary(objects: ObjectRecords) -> dict[str, float | None]:
         "coverage90_position": _mean(inside(objects.position_mass)),
         "coverage90_latent": _mean(inside(objects.latent_mass)),
         "median_range_error": _median(objects.range_error),
+        "median_depth_error_known_size": _median(objects.sized_depth_error),
     }
 
 
