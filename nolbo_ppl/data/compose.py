@@ -6,13 +6,12 @@ a bottle and an aeroplane can stand side by side and every category shows at eve
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.data import clutter
 from nolbo_ppl.data.backdrop import sample_backdrop, sample_light
+from nolbo_ppl.data.footprint import Footprint
 from nolbo_ppl.data.materials import sample_material, sample_materials
 from nolbo_ppl.data.pictures import Photographs
 from nolbo_ppl.data.pool import BLOCK, ShapePool
@@ -47,28 +46,6 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-@dataclass(frozen=True)
-class _Footprint:
-    """An upright box that something occupies, in the world frame."""
-
-    centre: Float[np.ndarray, " 2"]
-    axes: Float[np.ndarray, "2 2"]
-    """Rows: its horizontal axes."""
-    half: Float[np.ndarray, " 2"]
-    z: tuple[float, float]
-
-    def meets(self, other: _Footprint) -> bool:
-        """Whether two boxes overlap: no separating axis among theirs."""
-        if self.z[0] >= other.z[1] or other.z[0] >= self.z[1]:
-            return False
-        gap = other.centre - self.centre
-        for axis in (*self.axes, *other.axes):
-            reach = np.abs(self.axes @ axis) @ self.half + np.abs(other.axes @ axis) @ other.half
-            if abs(gap @ axis) >= reach:
-                return False
-        return True
-
-
 class _Composer:
     """Finds places: draws a pixel and a size, stands the thing on the ground there, refuses overlaps."""
 
@@ -82,7 +59,7 @@ class _Composer:
         shift = rng.uniform(-1, 1, 2) * config.principal_point * self.size
         self.intrinsics = np.array([focal, focal, self.size / 2 + shift[0], self.size / 2 + shift[1]])
         self.up = self.R_camera_world[:, 2]
-        self.footprints: list[_Footprint] = []
+        self.footprints: list[Footprint] = []
         self.seen: list[tuple[np.ndarray, float]] = []
 
     def _pixel(self, pixels: float) -> np.ndarray:
@@ -126,7 +103,7 @@ class _Composer:
                 continue
             axes = np.eye(2) if flying else R_world_local[:2, :2].T
             half = (half_world[:2] if flying else 0.5 * extents[:2]) * diagonal
-            footprint = _Footprint(world[:2], axes, half, z)
+            footprint = Footprint(world[:2], axes, half, z)
             if any(footprint.meets(other) for other in self.footprints):
                 continue
             self.footprints.append(footprint)

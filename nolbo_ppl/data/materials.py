@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.data.textures import SURFACE_PATTERNS
 from nolbo_ppl.errors import input_error
 
-PATTERNS: tuple[str, ...] = ("none", "noise", "wood", "stripes")
-"""Solid textures, evaluated in the object's own frame."""
+PATTERNS: tuple[str, ...] = ("none", "noise", "wood", "stripes", *SURFACE_PATTERNS)
+"""Solid textures, evaluated in the object's own frame, then those laid out on its faces."""
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,8 @@ def trace(view: View) -> Hits:
     face = np.full((height, width), -1, dtype=np.int32)
     silhouette = np.zeros(len(view.placed))
     for k, placed in enumerate(view.placed):
+        if placed.vertices[:, 2].max() <= NEAR:
+            continue
         window = image_window(placed, view.intrinsics)
         window = np.array([0.0, 0.0, width, height]) if window is None else window
         x0, y0 = np.maximum(np.floor(window[:2]), [-width, -height]).astype(int)
@@ -117,6 +119,8 @@ def shadowed(
     dark = np.zeros(len(points), dtype=bool)
     points, light = _f32(points, light)
     for placed in view.placed:
+        if not placed.casts_shadow:
+            continue
         centre, inverse = _f32(placed.offset, placed.inverse)
         near, offset = shading.behind_ball(points, dark, centre, np.float32(placed.radius), light)
         if len(near):
@@ -181,6 +185,7 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
     picture = np.zeros((1, 3)) if backdrop.picture is None else backdrop.picture.reshape(-1, 3)
     picture, ambient_sky, ambient_ground = _f32(picture, view.ambient_sky, view.ambient_ground)
     zenith, horizon = _f32(backdrop.zenith, backdrop.horizon)
+    (sky,) = _f32(np.eye(3) if backdrop.R_sky_camera is None else backdrop.R_sky_camera)
     colour = shading.illuminate(
         view.width,
         _f32(view.intrinsics)[0],
@@ -203,6 +208,8 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
         np.float32(view.camera_height),
         np.float32(backdrop.clouds),
         backdrop.seed,
+        sky,
+        np.float32(backdrop.mesh_haze),
         backdrop.picture is not None,
         picture,
     )

@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from nolbo_ppl.data.textures import noise_at, plane_pattern, wood_at
+from nolbo_ppl.data.textures import SOLID, noise_at, plane_pattern, surface_pattern, wood_at
 
 GROUND = -1
 WALL = -2
@@ -109,7 +109,13 @@ def surfaces(
                     for d in range(3):
                         q[c] += inverse[k, c, d] * (points[i, d] - offset[k, d])
                     q[c] *= material_frequency[m]
-                if material_pattern[m] == 1:
+                if material_pattern[m] >= SOLID:
+                    # Laid out on the face itself, and faded where a pixel covers more than its detail.
+                    range2 = points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2
+                    cosine = abs(towards) / (max(length, 1e-20) * math.sqrt(x * x + y * y + 1))
+                    pixel = math.sqrt(range2 / max(cosine, 0.02)) / intrinsics[0] * material_frequency[m]
+                    value = surface_pattern(int(material_pattern[m]), q, face_normals[f], texture_seed[k], pixel)
+                elif material_pattern[m] == 1:
                     value = float(noise_at(q[0], q[1], q[2], texture_seed[k], 1, True))
                 elif material_pattern[m] == 2:
                     value = wood_at(q[0], q[1], q[2], texture_seed[k])
@@ -208,6 +214,8 @@ def illuminate(
     camera_height: np.float32,
     clouds: np.float32,
     cloud_seed: int,
+    sky: np.ndarray,
+    mesh_haze: np.float32,
     has_picture: bool,
     picture: np.ndarray,
 ) -> np.ndarray:
@@ -227,7 +235,10 @@ def illuminate(
             height = -(ex * up[0] + ey * up[1] + ez * up[2])
             cloud = 1.0
             if clouds > 0:
-                cloud += float(clouds * (noise_at(-4 * ex, -4 * ey, -4 * ez, cloud_seed, 3, True) - 0.5))
+                sx = -4 * (sky[0, 0] * ex + sky[0, 1] * ey + sky[0, 2] * ez)
+                sy = -4 * (sky[1, 0] * ex + sky[1, 1] * ey + sky[1, 2] * ez)
+                sz = -4 * (sky[2, 0] * ex + sky[2, 1] * ey + sky[2, 2] * ez)
+                cloud += float(clouds * (noise_at(sx, sy, sz, cloud_seed, 3, True) - 0.5))
             for c in range(3):
                 colour[i, c] = _sky(height, zenith, horizon, c) * cloud
             continue
@@ -265,6 +276,10 @@ def illuminate(
                 value = albedo[i, c] * (diffuse[c] + glow[m]) + shine[c]
                 seen = _sky(height, zenith, horizon, c) if height >= 0 else 0.8 * ambient_ground[c]
                 colour[i, c] = value + strength * (seen - value)
+            if mesh_haze > 0:
+                fog = 1 - math.exp(-((mesh_haze * points[i, 2]) ** 2))
+                for c in range(3):
+                    colour[i, c] += fog * (horizon[c] - colour[i, c])
         elif has_picture:
             for c in range(3):
                 colour[i, c] = picture[i, c] * diffuse[c] / max(full[c], 1e-6)

@@ -1,5 +1,4 @@
-"""Procedural textures: value noise, wood, stripes, checks and tiles as compiled functions of position.
-"""
+"""Procedural textures: value noise, wood, stripes, checks, tiles and masonry as compiled functions of position."""
 
 from __future__ import annotations
 
@@ -94,3 +93,69 @@ def plane_pattern(pattern: int, u: float, v: float, seed: int) -> float:
         a, b = u - math.floor(u), v - math.floor(v)
         return 1.0 if 0.06 < a < 0.94 and 0.06 < b < 0.94 else 0.0
     return 0.5
+
+
+SOLID = 4
+"""Number of the first of `SURFACE_PATTERNS` among the patterns of materials: those before are solid textures."""
+SURFACE_PATTERNS: tuple[str, ...] = ("grain", "leaves", "brick", "slabs", "planks", "siding", "lattice")
+"""Textures laid out on the faces of a mesh: along z and across it on upright faces, along x and y on level ones."""
+
+
+@numba.njit(cache=True)
+def _masonry(u: float, v: float, shift: float, joint_u: float, joint_v: float, seed: int) -> float:
+    """Rows of unit cells: 0 in the joints, else a hashed brightness of the cell in [0.3, 1]; `shift` moves each row."""
+    row = math.floor(v)
+    x = u + shift * row
+    column = math.floor(x)
+    if x - column < joint_u or v - row < joint_v:
+        return 0.0
+    cell = _lattice(np.uint32(np.int64(column)), np.uint32(np.int64(row)), np.uint32(0), np.uint32(seed))
+    return 0.3 + 0.7 * float(cell)
+
+
+@numba.njit(cache=True)
+def _grain(x: float, y: float, z: float, seed: int, pixel: float, solid: bool) -> float:
+    """Noise of three scales, 1, 1/4 and 1/12, each left out where a pixel covers it; stretched to [0, 1]."""
+    total = 0.0
+    for level in range(3):
+        scale = 1.0 if level == 0 else (4.0 if level == 1 else 12.0)
+        fade = 1.0 / (1.0 + (1.5 * scale * pixel) ** 4)
+        if fade > 0.03:
+            noise = float(noise_at(x * scale, y * scale, z * scale, seed + 7 * level, 1, solid))
+            total += fade * (noise - 0.5) * (0.8 if level == 0 else 0.7)
+    return min(max(0.5 + total, 0.0), 1.0)
+
+
+@numba.njit(cache=True)
+def surface_pattern(pattern: int, q: np.ndarray, normal: np.ndarray, seed: int, pixel: float) -> float:
+    """Brightness in [0, 1] of pattern `SURFACE_PATTERNS[pattern - SOLID]` at a point of a face.
+
+    Args:
+        pattern: number among the patterns of materials, at least `SOLID`.
+        q: point [3] in the mesh's frame, in units of the period.
+        normal: unit normal [3] of the face in the mesh's frame.
+        seed: which random texture.
+        pixel: side of what one pixel covers, in units of the period; detail below it fades.
+    """
+    kind = pattern - SOLID
+    if kind == 1:
+        return _grain(q[0], q[1], q[2], seed, pixel, True)
+    u, v = float(q[0]), float(q[1])
+    across = math.sqrt(normal[0] ** 2 + normal[1] ** 2)
+    if across > 0.7:
+        u, v = (normal[0] * q[1] - normal[1] * q[0]) / across, float(q[2])
+    if kind == 0:
+        return _grain(u, v, 0.0, seed, pixel, False)
+    if kind == 2:
+        mean, value, detail = 0.55, _masonry(u, 3 * v, 0.5, 0.05, 0.14, seed), 2.0
+    elif kind == 3:
+        mean, value, detail = 0.6, _masonry(u, v, 0.0, 0.04, 0.04, seed), 1.2
+    elif kind == 4:
+        mean, value, detail = 0.6, _masonry(0.14 * u, v, 0.37, 0.006, 0.05, seed), 1.5
+        value *= 0.85 + 0.15 * wood_at(0.5 * u, 2 * v, 0.0, seed)
+    elif kind == 5:
+        mean, value, detail = 0.5, v - math.floor(v), 1.0
+    else:
+        a, b = abs(u - math.floor(u) - 0.5), abs(v - math.floor(v) - 0.5)
+        mean, value, detail = 0.5, (1.0 if a + b < 0.3 else (0.0 if a + b < 0.42 else 0.6)), 1.5
+    return mean + (value - mean) / (1.0 + (detail * pixel) ** 4)

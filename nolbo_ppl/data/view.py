@@ -51,6 +51,8 @@ class Placed:
     """Number of the labelled object it belongs to, or -1 for clutter."""
     texture_seed: int = 0
     """Which random texture its materials show."""
+    casts_shadow: bool = True
+    """Whether it hides other things from the lights: a ceiling should not."""
 
     @cached_property
     def inverse(self) -> Float[np.ndarray, "3 3"]:
@@ -122,6 +124,10 @@ class Backdrop:
     """Contrast of clouds in the sky."""
     seed: int = 0
     """Which clouds."""
+    R_sky_camera: Float[np.ndarray, "3 3"] | None = None
+    """Takes directions of the camera frame into the frame the clouds are fixed in; None: they are fixed in the camera."""
+    mesh_haze: float = 0.0
+    """Meshes fade into the horizon by `1 - exp(-(mesh_haze * depth)^2)`; 0 for clear air."""
 
 
 @dataclass(frozen=True)

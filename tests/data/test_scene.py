@@ -10,7 +10,8 @@ import torch
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.arrays import allocentric_viewpoints, empty_labels, fill_rendered
-from nolbo_ppl.data.compose import _Footprint, camera_rotation
+from nolbo_ppl.data.compose import camera_rotation
+from nolbo_ppl.data.footprint import Footprint
 from nolbo_ppl.data.pool import SEED_STRIDE, ShapePool
 from nolbo_ppl.data.render import trace
 from nolbo_ppl.data.scene import Rendered, Scene, amodal_box, render_scene
@@ -213,7 +214,7 @@ def test_footprints_meet_when_they_share_a_point() -> None:
             a = rng.uniform(-np.pi, np.pi)
             axes = np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
             low = rng.uniform(-1, 1)
-            boxes.append(_Footprint(rng.uniform(-1, 1, 2), axes, rng.uniform(0.1, 0.8, 2), (low, low + 0.8)))
+            boxes.append(Footprint(rng.uniform(-1, 1, 2), axes, rng.uniform(0.1, 0.8, 2), (low, low + 0.8)))
         points = rng.uniform(-1, 1, (4000, 2)) * boxes[0].half @ boxes[0].axes + boxes[0].centre
         inside = (np.abs((points - boxes[1].centre) @ boxes[1].axes.T) <= boxes[1].half).all(axis=1).any()
         overlap = min(boxes[0].z[1], boxes[1].z[1]) > max(boxes[0].z[0], boxes[1].z[0])
