@@ -1,0 +1,119 @@
+"""The guide on every keyframe: the lines of `observations.jsonl`, positions refined where depth is at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from tqdm import tqdm
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.observations import Observations
+from nolbo_ppl.mission.depth import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+class Observer(Protocol):
+    """What observing needs of a model (`ObservationModel`, or `Pyramid` for several sizes)."""
+
+    def observe(self, images: Any, intrinsics: Any = None, **options: Any) -> Any:
+        """Posterior of every object of each image."""
+
+
+class DepthSource(Protocol):
+    """Depth of a keyframe."""
+
+    scale: DepthScale
+    """Its errors."""
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe's image along the optical axis, m, NaN unknown; None when there is none."""
+
+
+class DepthPictures:
+    """Depth from a folder of 16 bit pictures.
+
+    Args:
+        paths: one a keyframe, None where there is none.
+        scale: what their numbers mean.
+    """
+
+    def __init__(self, paths: Sequence[Path | None], scale: DepthScale) -> None:
+        self.paths, self.scale = tuple(paths), scale
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe."""
+        path = self.paths[k]
+        return None if path is None else read_depth(path, self.scale)
+
+
+class StereoPairs:
+    """Depth by matching the right image of each keyframe.
+
+    Args:
+        right: reads the right image of a keyframe.
+        focal: focal length, px.
+        baseline: distance of the cameras, m.
+    """
+
+    def __init__(self, right: Callable[[int], Picture], focal: float, baseline: float) -> None:
+        self.right, self.focal, self.baseline = right, focal, baseline
+        self.scale = stereo_scale(focal, baseline)
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe."""
+        return stereo_depth(image, self.right(k), self.focal, self.baseline)
+
+
+def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Path | None]:
+    """The file of a folder that belongs to each image: of the same stem, or, where no stem fits, of the same number.
+
+    Raises:
+        InputError: no such folder, or neither stems nor numbers fit.
+    """
+    if not folder.is_dir():
+        raise input_error("no such folder", file=folder)
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"))
+    by_stem = {path.stem: path for path in files}
+    found = [by_stem.get(Path(image).stem) for image in images]
+    if any(found):
+        return found
+    if len(files) <= max(index, default=-1):
+        raise input_error("pictures that belong to no image", got=f"{len(files)} files",
+                          expected="the images' names, or one each", file=folder)  # fmt: skip
+    return [files[i] for i in index]
+
+
+def observed_rows(
+    model: Observer, read: Callable[[int], Picture], names: Sequence[str], intrinsics: Float[np.ndarray, " 4"], *,
+    threshold: float, batch: int, depth: DepthSource | None = None, **options: Any,
+) -> Iterator[dict[str, Any]]:
+    """Lines of `observations.jsonl`, batch by batch, with a progress bar on a terminal.
+
+    Args:
+        model: observes images.
+        read: image of a keyframe.
+        names: what each keyframe's image is called.
+        intrinsics: [fx, fy, cx, cy], px.
+        threshold: least objectness.
+        batch: images in memory at once.
+        depth: refines positions where given.
+        options: passed on to the model.
+    """
+    with tqdm(total=len(names), desc="observing", unit="image", disable=None) as bar:
+        for first in range(0, len(names), batch):
+            frames = range(first, min(first + batch, len(names)))
+            images = [read(k) for k in frames]
+            answers: list[Observations] = model.observe(
+                images, intrinsics, threshold=threshold, decode=False, batch=batch, **options
+            )
+            for k, image, observed in zip(frames, images, answers):
+                known = None if depth is None else depth.depth(k, image)
+                if depth is not None and known is not None:
+                    observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
+                yield from observed.rows(k, names[k])
+            bar.update(len(frames))

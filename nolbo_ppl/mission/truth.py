@@ -1,0 +1,175 @@
+"""What is true in a drive: objects, their shapes, and which of them a frame shows; and whose a detection is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import quaternion_to_matrix
+from nolbo_ppl.io import read_json, read_jsonl
+from nolbo_ppl.metrics.detection import match_image
+
+LEAST_SIDE = 12.0
+"""Objects whose box is smaller than this, px, need not be found."""
+LEAST_VISIBILITY = 0.5
+"""Objects of which less is seen need not be found."""
+IOU = 0.5
+"""Overlap of a detection with the object it is of."""
+
+
+@dataclass(frozen=True)
+class TrueFrame:
+    """Objects seen in one frame."""
+
+    object: Int[np.ndarray, " m"]
+    """Number of each in the drive."""
+    box: Float[np.ndarray, "m 4"]
+    """[x0, y0, x1, y1], px."""
+    position: Float[np.ndarray, "m 3"]
+    """Box centre in the camera frame, m."""
+    R_camera_object: Float[np.ndarray, "m 3 3"]
+    """Egocentric rotation."""
+    visibility: Float[np.ndarray, " m"]
+    """Visible share."""
+
+    @property
+    def counts(self) -> Bool[np.ndarray, " m"]:
+        """Objects that are to be found: large enough, and seen well enough."""
+        side = np.max(self.box[:, 2:] - self.box[:, :2], axis=1, initial=0.0)
+        return (side >= LEAST_SIDE) & (self.visibility >= LEAST_VISIBILITY)
+
+
+@dataclass(frozen=True)
+class DriveTruth:
+    """True objects of a drive."""
+
+    names: tuple[str, ...]
+    """`id` of each object."""
+    category: tuple[str, ...]
+    """Its category."""
+    instance: tuple[str, ...]
+    """Its shape's name."""
+    T_world_object: Float[np.ndarray, "m 4 4"]
+    """Its pose, at the start where it moves."""
+    diagonal: Float[np.ndarray, " m"]
+    """Its box diagonal, m."""
+    symmetry: Int[np.ndarray, " m"]
+    """1 none, n n-fold, 0 free about the vertical axis."""
+    moving: Bool[np.ndarray, " m"]
+    """Whether it moves."""
+    packed: Mapping[str, UInt8[np.ndarray, " bytes"]]
+    """Packed 32^3 grid by instance."""
+    frames: tuple[TrueFrame, ...]
+    """What each keyframe shows."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def _frame(objects: Sequence[Mapping[str, Any]], number: Mapping[str, int], file: Path, line: int) -> TrueFrame:
+    for thing in objects:
+        if thing.get("id") not in number:
+            raise input_error("an object that objects.json does not know", got=thing.get("id"), file=file, line=line)
+    n = len(objects)
+    quaternion = np.array([thing["rotation"] for thing in objects], dtype=np.float64).reshape(n, 4)
+    return TrueFrame(
+        object=np.array([number[thing["id"]] for thing in objects], dtype=np.int64),
+        box=np.array([thing["box"] for thing in objects], dtype=np.float64).reshape(n, 4),
+        position=np.array([thing["position"] for thing in objects], dtype=np.float64).reshape(n, 3),
+        R_camera_object=quaternion_to_matrix(quaternion) if n else np.zeros((0, 3, 3)),
+        visibility=np.array([thing.get("visibility", 1.0) for thing in objects], dtype=np.float64),
+    )
+
+
+def read_truth(drive: Path, images: Sequence[str]) -> DriveTruth:
+    """True objects of a drive folder, frame by frame for the given images.
+
+    Args:
+        drive: folder with `objects.json`, `scenes.jsonl` and `voxels.npz`.
+        images: names of the keyframes' images; the last part of a path decides.
+
+    Raises:
+        InputError: a file is missing or malformed, or an image has no line in `scenes.jsonl`.
+    """
+    things = read_json(drive / "objects.json")
+    try:
+        names = tuple(str(thing["id"]) for thing in things)
+        poses = np.array([thing["T_world_object"] for thing in things], dtype=np.float64).reshape(-1, 4, 4)
+        diagonal = np.array([thing["diagonal"] for thing in things], dtype=np.float64)
+        category, instance = (tuple(str(thing[key]) for thing in things) for key in ("category", "instance"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise input_error("not the objects of a drive", got=repr(error), file=drive / "objects.json") from None
+    number = {name: i for i, name in enumerate(names)}
+    scenes, by_image = drive / "scenes.jsonl", {}
+    wanted = {Path(image).name for image in images}
+    for line, row in read_jsonl(scenes):
+        image = Path(str(row.get("image"))).name
+        if image in wanted:
+            try:
+                by_image[image] = _frame(row["objects"], number, scenes, line)
+            except (KeyError, TypeError) as error:
+                raise input_error("not a line of a drive", got=repr(error), file=scenes, line=line) from None
+    missing = [image for image in images if Path(image).name not in by_image]
+    if missing:
+        raise input_error("truth lacks an image", got=missing[0], expected="a line in scenes.jsonl", file=scenes)
+    with np.load(drive / "voxels.npz", allow_pickle=False) as arrays:
+        packed = {name: arrays[name] for name in arrays.files}
+    return DriveTruth(
+        names, category, instance, poses, diagonal,
+        symmetry=np.array([thing.get("symmetry", 1) for thing in things], dtype=np.int64),
+        moving=np.array([thing.get("moving", False) for thing in things], dtype=bool),
+        packed=packed,
+        frames=tuple(by_image[Path(image).name] for image in images),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Whose each detection is."""
+
+    object: Int[np.ndarray, " k"]
+    """Number of the true object, -1 for none."""
+    row: Int[np.ndarray, " k"]
+    """Its row in the truth of the frame, -1 for none."""
+    counted: Bool[np.ndarray, " k"]
+    """Matched to an object that was to be found."""
+    found: int
+    """Objects (of all frames) that were to be found and were."""
+    wanted: int
+    """Objects (of all frames) that were to be found."""
+
+    @property
+    def precision(self) -> float:
+        """Share of the detections that are of an object; those of hardly seen ones are left out."""
+        judged = self.counted | (self.object < 0)
+        return float(self.counted.sum() / judged.sum()) if judged.any() else float("nan")
+
+    @property
+    def recall(self) -> float:
+        """Share of the objects to be found that were."""
+        return self.found / self.wanted if self.wanted else float("nan")
+
+
+def match_detections(
+    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], objectness: Float[np.ndarray, " k"], truth: DriveTruth,
+    iou_threshold: float = IOU,
+) -> Matched:
+    """Match detections with the objects of their frames, greedily by objectness, at most one an object (as COCO does)."""
+    object_of, row_of = np.full(len(frame), -1), np.full(len(frame), -1)
+    counted = np.zeros(len(frame), dtype=bool)
+    found = wanted = 0
+    for t, seen in enumerate(truth.frames):
+        rows, counts = np.flatnonzero(frame == t), seen.counts
+        matched = match_image(box[rows], objectness[rows], seen.box, ~counts, iou_threshold)
+        hit = matched >= 0
+        object_of[rows[hit]], row_of[rows[hit]] = seen.object[matched[hit]], matched[hit]
+        counted[rows[hit]] = counts[matched[hit]]
+        found += int(counts[matched[hit]].sum())
+        wanted += int(counts.sum())
+    return Matched(object_of, row_of, counted, found, wanted)
