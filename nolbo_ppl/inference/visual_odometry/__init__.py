@@ -1,0 +1,47 @@
+"""Visual odometry, deliberately simple: features, essential matrix, a scale from outside, a covariance for every step."""
+
+from __future__ import annotations
+
+from nolbo_ppl.inference.visual_odometry.compose import adjoint, at_keyframes, between, compose_covariance, keyframes
+from nolbo_ppl.inference.visual_odometry.config import (
+    GroundHeight,
+    KnownLengths,
+    OdometryConfig,
+    Scale,
+    StepFlag,
+    lengths_of,
+)
+from nolbo_ppl.inference.visual_odometry.odometry import (
+    FrameSource,
+    Odometry,
+    OdometryState,
+    Step,
+    VisualOdometry,
+    estimate_odometry,
+    init,
+    motion,
+    step,
+)
+
+__all__ = [
+    "FrameSource",
+    "GroundHeight",
+    "KnownLengths",
+    "Odometry",
+    "OdometryConfig",
+    "OdometryState",
+    "Scale",
+    "Step",
+    "StepFlag",
+    "VisualOdometry",
+    "adjoint",
+    "at_keyframes",
+    "between",
+    "compose_covariance",
+    "estimate_odometry",
+    "init",
+    "keyframes",
+    "lengths_of",
+    "motion",
+    "step",
+]

@@ -1,0 +1,214 @@
+"""The essential matrix between two views: residuals, their Jacobian, robust refinement, covariance.
+
+Points x1 of the earlier and x2 of the later camera obey `x1' E x2 = 0` with `E = [t]x R` and `T_earlier_later = (R, t)`.
+The length of t is not observable; it is 1 here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from nolbo_ppl.geometry.pose import skew, so3_exp
+from nolbo_ppl.inference.visual_odometry.config import OdometryConfig
+
+FREEDOM = 5.0
+"""Degrees of freedom of the Student t that weights residuals: mismatches have long tails."""
+GATE = 4.0
+"""Residuals beyond this many standard deviations are no inliers."""
+LEAST_SCALE = 0.02
+"""Least standard deviation of a corner, px: synthetic images can fit to rounding."""
+MAD = 1.4826
+"""Standard deviation of a normal variable over its median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """Motion between two views up to its length."""
+
+    R: Float[np.ndarray, "3 3"]
+    """Rotation of T_earlier_later."""
+    direction: Float[np.ndarray, " 3"]
+    """Direction of its translation, unit length."""
+    covariance: Float[np.ndarray, "5 5"]
+    """Of [rotation about the later camera's axes, direction along `tangent(direction)`], rad^2."""
+    inliers: Bool[np.ndarray, " m"]
+    """Which matches obey it."""
+    scale: float
+    """Standard deviation of a corner, px."""
+    cost: float
+    """Mean of the robust loss over all matches; less is better."""
+
+
+def rays(pixels: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "m 3"]:
+    """Rays [x / z, y / z, 1] of pixels."""
+    return np.column_stack([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones(len(pixels))])
+
+
+def tangent(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 2"]:
+    """Two orthonormal vectors across a unit vector."""
+    axis = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(direction, axis)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first)])
+
+
+def sampson(
+    R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"],
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 5"]]:
+    """Signed Sampson residuals in px and their Jacobian by [rotation, direction] (Hartley and Zisserman 2004, eq. 11.9).
+
+    A residual has the standard deviation of one coordinate of a corner. The Jacobian leaves out that of the
+    denominator: exact where the residual is zero.
+    """
+    E = skew(direction) @ R
+    line_first, line_second = second @ E.T, first @ E  # E x2, E' x1
+    error = np.sum(first * line_first, axis=1)
+    gradient = np.concatenate([line_first[:, :2], line_second[:, :2]], axis=1) / np.tile(intrinsics[:2], 2)
+    norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
+    by_rotation = np.cross(second, line_second)  # d(x1' [t]x R [w]x x2) = w . (x2 x E'x1)
+    by_direction = np.cross(second @ R.T, first) @ tangent(direction)  # x1' [t]x R x2 = t . (R x2 x x1)
+    return error / norm, np.concatenate([by_rotation, by_direction], axis=1) / norm[:, None]
+
+
+def depths(
+    R: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
+) -> Float[np.ndarray, "m 2"]:
+    """Inverse depths in the earlier and the later view of points `x1 / rho1 = R x2 / rho2 + t`, in the unit of 1 / |t|.
+
+    The equation crossed with R x2 (and with x1), in least squares; negative behind the camera, zero at infinity.
+    """
+    turned = second @ R.T
+    normal = np.cross(turned, first)
+    by_first = np.cross(turned, translation)  # rho1 (R x2 x t) = R x2 x x1
+    by_second = np.cross(first, translation)  # rho2 (x1 x t) = R x2 x x1
+    rho_first = np.sum(normal * by_first, axis=1) / np.maximum(np.sum(by_first**2, axis=1), 1e-18)
+    rho_second = np.sum(normal * by_second, axis=1) / np.maximum(np.sum(by_second**2, axis=1), 1e-18)
+    return np.column_stack([rho_first, rho_second])
+
+
+def student_weights(residual: Float[np.ndarray, " m"], scale: float) -> Float[np.ndarray, " m"]:
+    """Weights of Student's t for residuals in units of `scale`."""
+    return (FREEDOM + 1.0) / (FREEDOM + (residual / scale) ** 2)
+
+
+def robust_cost(residual: Float[np.ndarray, " m"], threshold: float) -> float:
+    """Mean of Geman and McClure's bounded loss, for comparing two motions on the same matches."""
+    square = (residual / threshold) ** 2
+    return float(np.mean(square / (1.0 + square)))
+
+
+def refine(
+    R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"], threshold: float, iterations: int = 12,
+) -> TwoView:
+    """Iteratively reweighted Gauss-Newton on the Sampson residuals from a first guess.
+
+    Inliers start at `threshold` px and follow the scale of the residuals, `GATE` times its robust estimate.
+    """
+    residual, jacobian = sampson(R, direction, first, second, intrinsics)
+    limit = threshold
+    for _ in range(iterations):
+        inside = np.abs(residual) < limit
+        if inside.sum() < 8:
+            break
+        scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE)
+        weight = np.where(inside, student_weights(residual, scale), 0.0)
+        normal = (jacobian * weight[:, None]).T @ jacobian
+        # Along a direction nobody measures the step must stay small, not blow up.
+        step = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), jacobian.T @ (weight * residual))
+        step *= min(1.0, 0.2 / max(float(np.abs(step).max()), 1e-12))
+        R = R @ so3_exp(step[:3])
+        direction = direction + tangent(direction) @ step[3:]
+        direction = direction / np.linalg.norm(direction)
+        limit = min(threshold * 2.0, max(GATE * scale, 0.1 * threshold))
+        residual, jacobian = sampson(R, direction, first, second, intrinsics)
+        if np.abs(step).max() < 1e-7:
+            break
+    inside = np.abs(residual) < limit
+    scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE) if inside.any() else threshold
+    covariance = sampson_covariance(residual[inside], jacobian[inside], scale)
+    return TwoView(R, direction, covariance, inside, scale, robust_cost(residual, threshold))
+
+
+def sampson_covariance(
+    residual: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m 5"], scale: float
+) -> Float[np.ndarray, "5 5"]:
+    """Covariance of the robust estimate, `(J'J)^-1 sum psi^2 / (m - 5) / mean(psi')^2` (Huber 1981, eq. 7.6.5).
+
+    Fewer than six residuals say nothing: a unit matrix.
+    """
+    if len(residual) < 6:
+        return np.eye(5)
+    square = (residual / scale) ** 2
+    psi = student_weights(residual, scale) * residual
+    slope = np.mean((FREEDOM + 1.0) * (FREEDOM - square) / (FREEDOM + square) ** 2)
+    variance = np.sum(psi**2) / (len(residual) - 5) / slope**2
+    information = jacobian.T @ jacobian
+    # The floor is one direction unobserved altogether: a standard deviation of about a radian there.
+    return variance * np.linalg.inv(information + variance * np.eye(5))
+
+
+def essential_by_consensus(
+    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"],
+    config: OdometryConfig,
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None:
+    """Rotation and unit translation of T_earlier_later by MAGSAC++ (Barath et al. 2020) on five points (Nister 2004).
+
+    None where no sample gave a motion with the points before both cameras. Deterministic by the seed.
+    """
+    fx, fy, cx, cy = intrinsics
+    camera = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    options = cv2.UsacParams()
+    options.confidence, options.maxIterations, options.threshold = config.confidence, config.iterations, config.threshold
+    options.score, options.loMethod = cv2.SCORE_METHOD_MAGSAC, cv2.LOCAL_OPTIM_SIGMA
+    options.randomGeneratorState, options.isParallel = config.seed, False
+    try:
+        E, mask = cv2.findEssentialMat(second, first, camera, camera, None, None, options)
+    except cv2.error:  # a minimal solver that failed on every sample
+        return None
+    if E is None or mask is None or E.shape[0] < 3 or not np.isfinite(E).all():
+        return None
+    # recoverPose takes points of the later camera to the earlier one: T_earlier_later.
+    count, R, translation, _ = cv2.recoverPose(E[:3], second, first, camera, mask=mask.copy())
+    if count < 5 or not (np.isfinite(R).all() and np.isfinite(translation).all()):
+        return None
+    return R, translation[:, 0] / np.linalg.norm(translation)
+
+
+def two_view(
+    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"],
+    config: OdometryConfig, guess: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None = None,
+) -> TwoView | None:
+    """Motion between two views by RANSAC and refinement; `guess`, the step before, competes as a second start.
+
+    None where there are too few matches or inliers.
+    """
+    if len(first) < config.least_inliers:
+        return None
+    found = essential_by_consensus(first, second, intrinsics, config)
+    starts = [start for start in (found, guess) if start is not None]
+    ray_first, ray_second = rays(first, intrinsics), rays(second, intrinsics)
+    candidates = []
+    for R, direction in starts:
+        view = refine(R, direction, ray_first, ray_second, intrinsics, config.threshold)
+        rho = depths(view.R, view.direction, ray_first, ray_second)
+        behind = (rho.min(axis=1) < 0) & view.inliers
+        if behind.sum() > 0.5 * view.inliers.sum():  # the mirrored translation: all points change sides
+            direction = -view.direction
+            view = TwoView(view.R, direction, mirrored(view.covariance, direction), view.inliers, view.scale, view.cost)
+        candidates.append(view)
+    good = [view for view in candidates if view.inliers.sum() >= config.least_inliers]
+    return min(good, key=lambda view: view.cost) if good else None
+
+
+def mirrored(covariance: Float[np.ndarray, "5 5"], direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "5 5"]:
+    """Covariance of the opposite direction, in the tangent of the new one."""
+    turn = np.eye(5)
+    turn[3:, 3:] = -tangent(direction).T @ tangent(-direction)
+    return turn @ covariance @ turn.T
