@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +27,9 @@ class SlamArguments:
     """Observations: JSON Lines, one detection a line (see docs/slam.md)."""
     out: Path
     """Folder for trajectory.txt, landmarks.json, associations.jsonl, summary.json and map.png."""
+    odometry_covariance: Path | None = None
+    """Covariance of every odometry step: NPZ with `covariance` [n - 1, 6, 6], [rotation rad, translation m] at the later
+    camera."""
     truth: Path | None = None
     """True trajectory, for errors before and after: rows of the odometry, or TUM rows matched by time."""
     model: str | None = None
@@ -58,6 +62,24 @@ def matched_truth(odometry: Trajectory, path: Path) -> np.ndarray:
     return truth.T_world_camera[partner]
 
 
+def read_covariance(path: Path) -> np.ndarray:
+    """Array `covariance` of an NPZ file.
+
+    Raises:
+        InputError: no such file, or it holds no such array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if "covariance" not in file.files:
+                raise input_error("no array `covariance`", got=file.files, file=path)
+            return np.asarray(file["covariance"], dtype=np.float64)
+    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
+        if isinstance(error, NolboError):
+            raise
+        raise input_error("odometry covariance cannot be read", got=str(error), expected="an NPZ file with `covariance`",
+                          file=path) from None
+
+
 def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     """Read, solve, write; returns the result and the summary.
 
@@ -67,7 +89,8 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     odometry = read_trajectory(arguments.odometry)
     table = read_observations(arguments.observations, frames=len(odometry))
     truth = None if arguments.truth is None else matched_truth(odometry, arguments.truth)
-    problem = SlamProblem(odometry.T_world_camera, table)
+    covariance = None if arguments.odometry_covariance is None else read_covariance(arguments.odometry_covariance)
+    problem = SlamProblem(odometry.T_world_camera, table, covariance)
     model = None
     if arguments.model is not None:
         from nolbo_ppl.inference.weights import load

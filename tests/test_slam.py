@@ -47,12 +47,20 @@ def test_every_file_is_written(folder: Path, tmp_path: Path, capsys: pytest.Capt
           "--config.em-iterations", "2"])
     assert "ATE" in capsys.readouterr().out
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "associations.jsonl", "landmarks.json", "landmarks_voxels.npz", "map.png", "summary.json", "trajectory.txt"]
+        "associations.jsonl", "iterations.npz", "landmarks.json", "landmarks_voxels.npz", "map.png", "summary.json",
+        "trajectory.txt"]
     back = read_trajectory(tmp_path / "trajectory.txt")
     assert back.format == "tum" and len(back) == 120 and back.times is not None and back.times[0] == 100.0
     ids = [json.loads(line)["id"] for line in (folder / "observations.jsonl").read_text().splitlines()]
     rows = [json.loads(line) for line in (tmp_path / "associations.jsonl").read_text().splitlines()]
     assert [row["id"] for row in rows] == ids
+    with np.load(tmp_path / "iterations.npz", allow_pickle=False) as history:
+        poses = history["T_world_camera"]
+        assert poses.dtype == np.float32 and len(history.files) == len(poses) + 1 and len(poses) > 2
+        np.testing.assert_allclose(poses[0], read_trajectory(folder / "odometry.txt").T_world_camera, atol=1e-4)
+        np.testing.assert_allclose(poses[-1], back.T_world_camera, atol=1e-4)
+        landmarks = [landmark["position"] for landmark in json.loads((tmp_path / "landmarks.json").read_text())]
+        np.testing.assert_allclose(history[f"landmarks_{len(poses) - 1}"], landmarks, atol=1e-4)
     names = {landmark["name"] for landmark in json.loads((tmp_path / "landmarks.json").read_text())}
     with np.load(tmp_path / "landmarks_voxels.npz", allow_pickle=False) as voxels:
         assert set(voxels.files) == {f"{name}/{part}" for name in names for part in ("mean", "variance")}
@@ -77,6 +85,25 @@ def test_kitti_in_kitti_out_and_no_observations(folder: Path, tmp_path: Path) ->
     assert back.format == "kitti"
     np.testing.assert_allclose(back.T_world_camera, read_trajectory(folder / "kitti.txt").T_world_camera, atol=1e-6)
     assert json.loads((tmp_path / "out" / "landmarks.json").read_text()) == []
+
+
+def test_covariances_of_odometry_steps(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    n = len(read_trajectory(folder / "odometry.txt"))
+    scale = np.repeat([0.01, 0.03], 3)
+    np.savez(tmp_path / "good.npz", covariance=np.tile(np.diag(scale**2), (n - 1, 1, 1)))
+    bad = np.tile(np.diag(scale**2), (n - 1, 1, 1))
+    bad[7, 2, 2] = -1.0
+    np.savez(tmp_path / "bad.npz", covariance=bad)
+    np.savez(tmp_path / "other.npz", sigma=bad)
+    (tmp_path / "text.npz").write_text("no archive")
+    option = "odometry-covariance"
+    main(arguments(folder, tmp_path / "out", **{option: str(tmp_path / "good.npz"), "truth": str(folder / "truth.txt")}))
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["after"]["ate"] < summary["before"]["ate"]
+    for name, match in (("bad", "step 7"), ("other", "no array `covariance`"), ("text", "cannot be read"), ("none", "cannot")):
+        with pytest.raises(SystemExit):
+            main(arguments(folder, tmp_path / "no", **{option: str(tmp_path / f"{name}.npz")}))
+        assert match in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -116,5 +143,5 @@ def test_interruption_leaves_no_half_written_file(
     monkeypatch.setattr(export, "association_rows", interrupted)
     with pytest.raises(KeyboardInterrupt):
         main([*arguments(folder, tmp_path), "--config.em-iterations", "1"])
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["landmarks.json", "trajectory.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["iterations.npz", "landmarks.json", "trajectory.txt"]
     json.loads((tmp_path / "landmarks.json").read_text())

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,18 @@ class ObservationTable:
     """Order of the symmetry about the object's vertical axis (0 free); -1: that of the category."""
     id: tuple[str, ...]
     """Identifiers; the row number where the file had none."""
+    mode_weight: Float[np.ndarray, "n K"] = field(default_factory=lambda: np.zeros((0, 0)))
+    """Weights of the modes of the orientation, 0 where there are fewer; K is 0 when nobody states any."""
+    mode_rotation: Float[np.ndarray, "n K 3 3"] = field(default_factory=lambda: np.zeros((0, 0, 3, 3)))
+    """R_camera_object of every mode, the identity where there are fewer."""
+    mode_std: Float[np.ndarray, "n K"] = field(default_factory=lambda: np.ones((0, 0)))
+    """Standard deviation of each angle of every mode, rad; 1 where there are fewer."""
+
+    def __post_init__(self) -> None:
+        if len(self.mode_weight) != len(self.frame) and not self.mode_weight.shape[1]:  # a table without modes
+            object.__setattr__(self, "mode_weight", np.zeros((len(self.frame), 0)))
+            object.__setattr__(self, "mode_rotation", np.zeros((len(self.frame), 0, 3, 3)))
+            object.__setattr__(self, "mode_std", np.ones((len(self.frame), 0)))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -52,6 +64,11 @@ class ObservationTable:
     def latent_dim(self) -> int:
         """Dimension of the latents, 0 when there are none."""
         return self.latent.shape[1]
+
+    @property
+    def modes(self) -> int:
+        """Most modes an orientation has, 0 when none are stated."""
+        return self.mode_weight.shape[1]
 
     @property
     def has_rotation(self) -> Bool[np.ndarray, " n"]:
@@ -74,7 +91,7 @@ class ObservationTable:
 
 ARRAYS = (
     "frame", "position", "position_covariance", "rotation", "rotation_scale", "latent", "latent_scale", "objectness",
-    "size", "symmetry",
+    "size", "symmetry", "mode_weight", "mode_rotation", "mode_std",
 )
 
 
@@ -82,7 +99,7 @@ def make_table(
     frame: Any, position: Any, *, position_covariance: Any = None, position_scale: Any = None, rotation: Any = None,
     rotation_scale: Any = None, latent: Any = None, latent_scale: Any = None, objectness: Any = None,
     category: Iterable[str | None] | None = None, size: Any = None, symmetry: Any = None,
-    id: Iterable[str] | None = None,
+    id: Iterable[str] | None = None, mode_weight: Any = None, mode_rotation: Any = None, mode_std: Any = None,
 ) -> ObservationTable:
     """Build a table from numpy arrays; everything but frame and position is optional, scalars are broadcast.
 
@@ -92,12 +109,17 @@ def make_table(
         position_covariance: [n, 3, 3] m^2, or `position_scale` [n, 3], [n] or a number in m.
         rotation: [n, 3, 3] R_camera_object.
         latent: [n, d]; `latent_scale` [n, d], [n] or a number.
+        mode_weight: [n, K] weights of the orientation's modes (0: no such mode), with `mode_rotation` [n, K, 3, 3] and
+            `mode_std` [n, K] or a number in rad; where `rotation` is not given it is the heaviest mode.
 
     Raises:
         InputError: shapes do not match.
     """
     frame = np.asarray(frame, dtype=np.int64).reshape(-1)
     n = len(frame)
+    count = 0 if mode_weight is None else np.asarray(mode_weight).shape[-1]
+    if count and (mode_rotation is None or mode_std is None):
+        raise input_error("modes of the orientation are incomplete", expected="mode_weight, mode_rotation and mode_std")
 
     def full(value: Any, shape: tuple[int, ...], name: str, default: float = np.nan) -> np.ndarray:
         if value is None:
@@ -114,6 +136,13 @@ def make_table(
     if position_covariance is None and position_scale is not None:
         scale = full(position_scale, (n, 3), "position_scale")
         position_covariance = scale[:, :, None] ** 2 * np.eye(3)
+    modes: dict[str, np.ndarray] = {}
+    if count:
+        modes = {"mode_weight": full(mode_weight, (n, count), "mode_weight"),
+                 "mode_rotation": full(mode_rotation, (n, count, 3, 3), "mode_rotation"),
+                 "mode_std": full(mode_std, (n, count), "mode_std")}
+        if rotation is None:
+            rotation, rotation_scale = heaviest_mode(**modes)
     categories = tuple(category) if category is not None else (None,) * n
     ids = tuple(id) if id is not None else tuple(str(i) for i in range(n))
     if len(categories) != n or len(ids) != n:
@@ -131,11 +160,36 @@ def make_table(
         size=full(size, (n, 3), "size"),
         symmetry=full(symmetry, (n,), "symmetry", default=-1.0).astype(np.int64),
         id=ids,
+        **modes,
+    )
+
+
+def heaviest_mode(
+    mode_weight: Float[np.ndarray, "n K"], mode_rotation: Float[np.ndarray, "n K 3 3"], mode_std: Float[np.ndarray, "n K"]
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, " n"]]:
+    """Rotation and scale of each row's heaviest mode, NaN where a row has none."""
+    row, best = np.arange(len(mode_weight)), np.argmax(mode_weight, axis=1)
+    none = mode_weight[row, best] <= 0
+    return (np.where(none[:, None, None], np.nan, mode_rotation[row, best]), np.where(none, np.nan, mode_std[row, best]))
+
+
+def with_modes(table: ObservationTable, count: int) -> ObservationTable:
+    """The same table with room for `count` modes an orientation."""
+    more = count - table.modes
+    if more <= 0:
+        return table
+    n = len(table)
+    return replace(
+        table, mode_weight=np.concatenate([table.mode_weight, np.zeros((n, more))], axis=1),
+        mode_rotation=np.concatenate([table.mode_rotation, np.tile(np.eye(3), (n, more, 1, 1))], axis=1),
+        mode_std=np.concatenate([table.mode_std, np.ones((n, more))], axis=1),
     )
 
 
 def concatenate(tables: list[ObservationTable]) -> ObservationTable:
     """Stack tables of one latent dimension."""
+    count = max(table.modes for table in tables)
+    tables = [with_modes(table, count) for table in tables]
     first = tables[0]
     return replace(
         first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in ARRAYS},
@@ -181,6 +235,16 @@ def check_table(table: ObservationTable, frames: int) -> None:
         scale = getattr(table, name).reshape(len(table), -1 if len(table) else 0)
         bad = ((scale <= 0) | np.isinf(scale)).any(axis=1)
         refuse(bad, f"{name} is not a positive number", scale, "greater than 0")
+    weight = table.mode_weight
+    refuse(~(np.isfinite(weight) & (weight >= 0)).all(axis=1), "mode_weight is no weight", weight, "0 or more")
+    stated = weight.sum(axis=1) > 0
+    refuse(stated & ~table.has_rotation, "modes without a rotation", weight, "`rotation`, the best mode, as well")
+    turned = table.mode_rotation
+    residual = np.abs(np.swapaxes(turned, 2, 3) @ turned - np.eye(3)).max(axis=(1, 2, 3), initial=0)
+    mirrored = (np.linalg.det(turned) < 0).any(axis=1)
+    refuse(~(residual < 1e-3) | mirrored, "mode_rotation is no rotation", turned, "orthonormal")
+    bad = (~(table.mode_std > 0) | np.isinf(table.mode_std)).any(axis=1)
+    refuse(bad, "mode_std is not a positive number", table.mode_std, "greater than 0")
     refuse(np.isinf(table.latent).any(axis=1), "latent is not finite", table.latent, "finite numbers")
     refuse(
         ~((table.objectness >= 0) & (table.objectness <= 1)), "objectness is no probability", table.objectness, "0 to 1"

@@ -1,9 +1,10 @@
 """Observations of objects as SLAM takes them: one table, read from and written to JSON Lines, checked field by field.
 
 One detection a line: `frame` (row of the odometry, from 0) and `position` [x, y, z] m in the camera frame; optional
-`position_std` (a number or 3) or `position_cov` (3x3), `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std`
-rad, `latent` [d], `latent_std` (a number or d), `objectness` (default 1), `category`, `size` [3] m, `symmetry` (1 none,
-n n-fold, 0 free about the object's vertical axis), `id` (carried through). What is missing is NaN in the table.
+`position_std` (a number or 3) or `position_cov` (3x3), `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
+`rotation_modes` (a list of `weight`, `rotation`, `std`: all modes of the orientation), `latent` [d], `latent_std` (a number
+or d), `objectness` (default 1), `category`, `size` [3] m, `symmetry` (1 none, n n-fold, 0 free about the object's vertical
+axis), `id` (carried through). What is missing is NaN in the table.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from nolbo_ppl.data.observation_table import (
     ObservationTable,
     check_table,
     concatenate,
+    heaviest_mode,
     make_table,
 )
 from nolbo_ppl.errors import input_error
@@ -64,6 +66,7 @@ _KNOWN = {
     "position_cov",
     "rotation",
     "rotation_std",
+    "rotation_modes",
     "latent",
     "latent_std",
     "objectness",
@@ -72,6 +75,39 @@ _KNOWN = {
     "symmetry",
     "id",
 }
+
+
+def _rotation(row: dict[str, Any], where: dict[str, Any], name: str = "rotation") -> np.ndarray:
+    quaternion = _vector(row, "rotation", 4, where)
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 1e-2:
+        raise input_error(f"`{name}` is no unit quaternion", got=f"length {norm:.4g}", expected="1",
+                          do="normalise it; the order is [qx, qy, qz, qw]", **where)
+    return quaternion_to_matrix(quaternion)
+
+
+def _modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The modes of an orientation; weights sum to one."""
+    if not isinstance(value, list) or not value or not all(isinstance(mode, dict) for mode in value):
+        raise input_error("`rotation_modes` is no list of modes", got=value,
+                          expected='[{"weight": w, "rotation": [qx, qy, qz, qw], "std": rad}, ...]', **where)
+    weight = []
+    for i, mode in enumerate(value):
+        if set(mode) != {"weight", "rotation", "std"}:
+            raise input_error(f"`rotation_modes` {i} has wrong fields", got=sorted(mode),
+                              expected="weight, rotation, std", **where)
+        w = mode["weight"]
+        if isinstance(w, bool) or not isinstance(w, (int, float)) or not np.isfinite(w) or w < 0:
+            raise input_error(f"`rotation_modes` {i}: `weight` is no weight", got=w, expected="0 or more", **where)
+        weight.append(float(w))
+    total = sum(weight)
+    if not abs(total - 1) < 1e-2:
+        raise input_error("weights of `rotation_modes` do not sum to one", got=total, expected="1", **where)
+    return {
+        "mode_weight": np.array(weight) / total,
+        "mode_rotation": np.stack([_rotation(mode, where, "rotation_modes") for mode in value]),
+        "mode_std": np.concatenate([_scale(mode, "std", 1, where) for mode in value]),
+    }
 
 
 def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
@@ -104,14 +140,16 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     elif row.get("position_std") is not None:
         out["position_covariance"] = np.diag(_scale(row, "position_std", 3, where) ** 2)
     if row.get("rotation") is not None:
-        quaternion = _vector(row, "rotation", 4, where)
-        norm = float(np.linalg.norm(quaternion))
-        if abs(norm - 1) > 1e-2:
-            raise input_error("`rotation` is no unit quaternion", got=f"length {norm:.4g}", expected="1",
-                              do="normalise it; the order is [qx, qy, qz, qw]", **where)
-        out["rotation"] = quaternion_to_matrix(quaternion)
+        out["rotation"] = _rotation(row, where)
     if row.get("rotation_std") is not None:
         out["rotation_scale"] = float(_scale(row, "rotation_std", 1, where)[0])
+    if row.get("rotation_modes") is not None:
+        modes = _modes(row["rotation_modes"], where)
+        out.update(modes)
+        if "rotation" not in out:
+            best, scale = heaviest_mode(**{name: value[None] for name, value in modes.items()})
+            out["rotation"] = best[0]
+            out.setdefault("rotation_scale", float(scale[0]))
     if row.get("latent") is not None:
         out["latent"] = _vector(row, "latent", None, where)
         if row.get("latent_std") is not None:
@@ -172,6 +210,7 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
         values["id"] = identity
         rows.append(values)
     d = dimension or 0
+    K = max((len(row["mode_weight"]) for row in rows if "mode_weight" in row), default=0)
     missing = {
         "position_covariance": np.full((3, 3), np.nan),
         "rotation": np.full((3, 3), np.nan),
@@ -180,11 +219,16 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
         "latent_scale": np.full(d, np.nan),
         "size": np.full(3, np.nan),
     }
+    padding = {"mode_weight": np.zeros(K), "mode_rotation": np.tile(np.eye(3), (K, 1, 1)), "mode_std": np.ones(K)}
     shapes = {"position": (3,), "position_covariance": (3, 3), "rotation": (3, 3), "latent": (d,), "latent_scale": (d,),
-              "size": (3,)}
+              "size": (3,), "mode_weight": (K,), "mode_rotation": (K, 3, 3), "mode_std": (K,)}
 
     def column(name: str) -> np.ndarray:
-        values = [row.get(name, missing.get(name)) for row in rows]
+        if name in padding:  # rows with fewer modes are padded
+            values = [np.concatenate([row[name], padding[name][len(row[name]):]]) if name in row else padding[name]
+                      for row in rows]
+        else:
+            values = [row.get(name, missing.get(name)) for row in rows]
         dtype = np.int64 if name in ("frame", "symmetry") else np.float64
         return np.array(values, dtype=dtype).reshape(len(rows), *shapes.get(name, ()))
 
@@ -212,6 +256,13 @@ def observation_row(table: ObservationTable, i: int) -> dict[str, Any]:
         row["rotation"] = _rounded(matrix_to_quaternion(table.rotation[i]), 8)
     if np.isfinite(table.rotation_scale[i]):
         row["rotation_std"] = float(table.rotation_scale[i])
+    used = np.flatnonzero(table.mode_weight[i] > 0)
+    if len(used):
+        row["rotation_modes"] = [
+            {"weight": float(table.mode_weight[i, k]),
+             "rotation": _rounded(matrix_to_quaternion(table.mode_rotation[i, k]), 8),
+             "std": float(table.mode_std[i, k])} for k in used
+        ]
     if table.latent_dim and np.isfinite(table.latent[i]).all():
         row["latent"] = _rounded(table.latent[i])
         if np.isfinite(table.latent_scale[i]).all():

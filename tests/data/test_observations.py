@@ -13,6 +13,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import so3_exp
 
 LINE = {"frame": 0, "position": [1.0, 2.0, 3.0]}
+MODE = {"weight": 1.0, "rotation": [0.0, 0.0, 0.0, 1.0], "std": 0.1}
 
 
 def write(path: Path, *rows: object) -> Path:
@@ -81,6 +82,13 @@ def test_an_empty_file_is_an_empty_table(tmp_path: Path) -> None:
         ({**LINE, "size": [1, 1]}, "`size` has the wrong shape"),
         ({**LINE, "symmetry": -2}, "no order"),
         ({**LINE, "postion_std": 1}, "unknown field.*postion_std"),
+        ({**LINE, "rotation_modes": []}, "no list of modes"),
+        ({**LINE, "rotation_modes": [[1, 2]]}, "no list of modes"),
+        ({**LINE, "rotation_modes": [{"weight": 1.0, "std": 0.1}]}, "`rotation_modes` 0 has wrong fields"),
+        ({**LINE, "rotation_modes": [{**MODE, "weight": -1}]}, "no weight"),
+        ({**LINE, "rotation_modes": [{**MODE, "weight": 0.5}]}, "do not sum to one"),
+        ({**LINE, "rotation_modes": [{**MODE, "rotation": [0, 0, 0, 2]}]}, "`rotation_modes` is no unit quaternion"),
+        ({**LINE, "rotation_modes": [{**MODE, "std": 0}]}, "no standard deviation"),
     ],
 )
 def test_damage_is_named_with_its_line(tmp_path: Path, change: object, match: str) -> None:
@@ -112,3 +120,34 @@ def test_tables_are_checked(change: dict[str, object], match: str) -> None:
     fields: dict[str, object] = {"frame": [0, 1], "position": np.ones((2, 3)), "id": ["good", "bad"], **change}
     with pytest.raises(InputError, match=f"'bad'.*{match}"):
         check_table(make_table(**fields), frames=5)  # type: ignore[arg-type]
+
+
+def test_modes_of_orientations_round_trip(tmp_path: Path) -> None:
+    turned = [0.0, 0.0, 1.0, 0.0]
+    both = [{**MODE, "weight": 0.3}, {"weight": 0.7, "rotation": turned, "std": 0.2}]
+    path = write(tmp_path / "o.jsonl", LINE, {**LINE, "rotation_modes": both}, {**LINE, "rotation_modes": [MODE]})
+    table = read_observations(path)
+    np.testing.assert_allclose(table.mode_weight, [[0, 0], [0.3, 0.7], [1, 0]])
+    np.testing.assert_allclose(table.mode_std, [[1, 1], [0.1, 0.2], [0.1, 1]])
+    assert table.has_rotation.tolist() == [False, True, True]
+    np.testing.assert_allclose(table.rotation[1], np.diag([-1.0, -1.0, 1.0]), atol=1e-12)  # the heavier one
+    assert table.rotation_scale[1] == 0.2
+    write_observations(tmp_path / "again.jsonl", table)
+    back = read_observations(tmp_path / "again.jsonl")
+    for name in ("mode_weight", "mode_rotation", "mode_std", "rotation"):
+        np.testing.assert_allclose(getattr(back, name), getattr(table, name), atol=1e-7)
+    check_table(back, 1)
+    joined = concatenate([make_table([0], [[0, 0, 1.0]]), back.select(np.array([1, 2]))])
+    np.testing.assert_allclose(joined.mode_weight, table.mode_weight)
+
+
+def test_modes_of_a_table_are_checked() -> None:
+    fields = {"frame": [0, 0], "position": np.ones((2, 3)), "mode_weight": np.ones((2, 1)), "mode_std": 0.1,
+              "mode_rotation": np.tile(np.eye(3), (2, 1, 1, 1)), "id": ["good", "bad"]}
+    check_table(make_table(**fields), 1)
+    with pytest.raises(InputError, match="incomplete"):
+        make_table([0], np.ones((1, 3)), mode_weight=np.ones((1, 1)))
+    for change, match in (({"mode_weight": [[1.0], [-1.0]]}, "mode_weight"), ({"mode_std": [[0.1], [0.0]]}, "mode_std"),
+                          ({"mode_rotation": np.stack([np.eye(3), 2 * np.eye(3)])[:, None]}, "mode_rotation")):
+        with pytest.raises(InputError, match=f"'bad'.*{match}"):
+            check_table(make_table(**{**fields, "rotation": np.eye(3), **change}), 1)

@@ -81,6 +81,29 @@ class SlamConfig:
     """How association marginals are computed (see `nolbo_ppl.inference.association`)."""
 
 
+def check_step_covariance(covariance: np.ndarray, steps: int) -> None:
+    """Refuse covariances of odometry steps that no graph can use.
+
+    Raises:
+        InputError: a wrong shape, or a row that is not finite, not symmetric, or not positive definite.
+    """
+    if covariance.shape != (steps, 6, 6):
+        raise input_error("odometry covariance has the wrong shape", got=covariance.shape, expected=(steps, 6, 6),
+                          do="give one 6 x 6 matrix a step, [rotation rad, translation m]")
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    usable = np.where(finite[:, None, None], covariance, np.eye(6))
+    largest = np.abs(usable).max(axis=(1, 2), initial=0)
+    symmetric = np.abs(usable - np.swapaxes(usable, 1, 2)).max(axis=(1, 2), initial=0) <= 1e-6 * largest
+    # Rotations and translations have units of their own: their correlation is what must be positive definite.
+    scale = np.sqrt(np.maximum(np.diagonal(usable, axis1=1, axis2=2), 1e-300))
+    correlation = usable / scale[:, :, None] / scale[:, None, :]
+    positive = np.linalg.eigvalsh(np.where(symmetric[:, None, None], correlation, np.eye(6)))[:, 0] > 1e-9
+    for good, what in ((finite, "finite"), (symmetric, "symmetric"), (positive, "positive definite")):
+        if not good.all():
+            row = int(np.argmin(good))
+            raise input_error(f"odometry covariance of step {row} (rows {row} to {row + 1}) is not {what}", got=covariance[row])
+
+
 @dataclass(frozen=True)
 class SlamProblem:
     """Odometry and observations of one drive."""
@@ -89,6 +112,9 @@ class SlamProblem:
     """Drifting T_world_camera, one row a frame."""
     observations: ObservationTable
     """Detections in these frames, rows in any order."""
+    odometry_covariance: Float[np.ndarray, "n-1 6 6"] | None = None
+    """Covariance of every odometry step, [rotation rad, translation m] in the tangent space of T_earlier_later at the later
+    camera (GTSAM's Pose3); None: scales of the configuration, or of the data."""
 
     def __post_init__(self) -> None:
         T = self.odometry
@@ -98,6 +124,8 @@ class SlamProblem:
         if bad.any():
             raise input_error("odometry holds a row that is no pose", got=T[int(np.argmax(bad))],
                               expected="finite, orthonormal", do=f"look at row {int(np.argmax(bad))}")
+        if self.odometry_covariance is not None:
+            check_step_covariance(self.odometry_covariance, len(T) - 1)
         check_table(self.observations, len(T))
 
     def __len__(self) -> int:
@@ -130,3 +158,5 @@ class NoiseModel:
     """Factor on position covariances in the graph, for errors that resemble one another from frame to frame."""
     rotation_factor: float = 1.0
     """The same for orientations."""
+    step_correlation: Float[np.ndarray, "n-1 6 6"] | None = None
+    """Covariance of each odometry step in units of its scales, where the problem states covariances."""

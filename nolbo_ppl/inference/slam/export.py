@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
@@ -13,9 +14,10 @@ import numpy as np
 
 from nolbo_ppl.data.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
+from nolbo_ppl.inference.slam.graph import Estimate
 from nolbo_ppl.inference.slam.result import Landmark, SlamResult
 from nolbo_ppl.inference.slam.shapes import LatentDecoder, write_voxels
-from nolbo_ppl.io import write_json, write_jsonl
+from nolbo_ppl.io import atomic_path, write_json, write_jsonl
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, relative_pose_error
 
 
@@ -93,6 +95,16 @@ def trajectory_errors(estimate: np.ndarray, truth: np.ndarray) -> dict[str, floa
     return out
 
 
+def write_iterations(path: str | PathLike[str], history: Sequence[Estimate]) -> None:
+    """Every iteration in one NPZ file, atomically: `T_world_camera` [i, n, 4, 4] float32, and `landmarks_0` [m, 3], ...,
+    the positions of the landmarks each iteration held, in m; 0 is the odometry, the last one the result.
+    """
+    arrays = {f"landmarks_{i}": x.T_world_landmark[:, :3, 3].astype(np.float32) for i, x in enumerate(history)}
+    poses = np.stack([x.T_world_camera for x in history]).astype(np.float32)
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, T_world_camera=poses, **arrays)  # type: ignore[arg-type]
+
+
 def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, Any]:
     """What `summary.json` holds."""
     state = result.state
@@ -143,6 +155,8 @@ def write_result(
     if model is not None:
         write_voxels(out / "landmarks_voxels.npz", result.decode_landmarks(model))
     write_trajectory(out / "trajectory.txt", Trajectory(result.T_world_camera, odometry.times, odometry.format))
+    if result.history:
+        write_iterations(out / "iterations.npz", result.history)
     write_json(out / "landmarks.json", [landmark_row(landmark) for landmark in result.landmarks])
     write_jsonl(out / "associations.jsonl", association_rows(result))
     if picture:

@@ -16,9 +16,9 @@ import scipy.sparse.linalg
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import NolboError
-from nolbo_ppl.geometry.pose import make_pose, relative, so3_log
+from nolbo_ppl.geometry.pose import make_pose, relative
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
-from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, nearest_mode_rotation, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import observed_modes, resolve_modes, resolved_symmetry
 
 LOOSE_ROTATION = 10.0
 """Scale of a rotation nobody observed, rad."""
@@ -96,39 +96,29 @@ def resolve_observations(
     problem: SlamProblem, noise: NoiseModel, config: SlamConfig, estimate: Estimate, rows: Int[np.ndarray, " k"],
     landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"],
 ) -> ObservationFactors:
-    """Measured relative poses of the given detections: the orientation mode nearest to the estimate, loose where none.
+    """Measured relative poses of the given detections; a factor of several orientation modes is split by their responsibilities.
 
-    An orientation nearer to the uniform part of its likelihood than to any mode is dropped (its position stays).
+    A mode with `SURE_MODE` stands alone. The share of the uninformative part keeps the position alone, as do detections
+    without an orientation.
     """
     table = problem.observations
     frame = table.frame[rows]
     predicted = relative(estimate.T_world_camera[frame], estimate.T_world_landmark[landmark])[:, :3, :3]
     oriented = table.has_rotation[rows]
-    observed = np.where(oriented[:, None, None], np.nan_to_num(table.rotation[rows]), predicted)
+    plain, o = np.flatnonzero(~oriented), np.flatnonzero(oriented)
+    symmetry = resolved_symmetry(table, config)[rows]
+    modes = resolve_modes(predicted[o], observed_modes(table, noise.rotation_scale, rows[o]), symmetry[o], config)
+    k = np.concatenate([plain, o[modes.row]])
     # Without an orientation the landmark's axes are the odometry's world axes: constant, so that the graph is too.
-    R_world_camera = problem.odometry[frame, :3, :3]
-    observed = np.where(oriented[:, None, None], observed, np.swapaxes(R_world_camera, 1, 2))
-    symmetry = np.where(oriented, resolved_symmetry(table, config)[rows], 1)
-    scale = noise.rotation_scale[rows]
-    if oriented.any():
-        o = np.flatnonzero(oriented)
-        observed[o] = nearest_mode_rotation(predicted[o], observed[o], symmetry[o])
-        error = so3_log(np.swapaxes(predicted[o], 1, 2) @ observed[o])
-        error[symmetry[o] == 0, 2] = 0.0
-        log_mode = -0.5 * np.sum(error**2, axis=1) / scale[o] ** 2 - 1.5 * np.log(2 * np.pi * scale[o] ** 2)
-        lost = (
-            log_mode + np.log1p(-config.orientation_outlier) < np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY
-        )
-        oriented[o[lost]] = False
-        observed[o[lost]] = predicted[o[lost]]
-    covariance = np.zeros((len(rows), 6, 6))
-    angular = np.where(oriented, scale * np.sqrt(noise.rotation_factor), LOOSE_ROTATION)
-    covariance[:, [0, 1, 2], [0, 1, 2]] = (angular**2)[:, None]
-    covariance[oriented & (symmetry == 0), 2, 2] = LOOSE_ROTATION**2
-    covariance[:, 3:, 3:] = noise.position_factor * (
-        np.swapaxes(observed, 1, 2) @ noise.position_covariance[rows] @ observed
-    )
-    return ObservationFactors(frame, landmark, make_pose(observed, table.position[rows]), covariance, weight)
+    R = np.concatenate([np.swapaxes(problem.odometry[frame[plain], :3, :3], 1, 2), modes.R])
+    angular = np.concatenate([np.full(len(plain), np.inf), modes.scale]) * np.sqrt(noise.rotation_factor)
+    informative = np.isfinite(angular)
+    covariance = np.zeros((len(k), 6, 6))
+    covariance[:, [0, 1, 2], [0, 1, 2]] = (np.where(informative, angular, LOOSE_ROTATION) ** 2)[:, None]
+    covariance[informative & (symmetry[k] == 0), 2, 2] = LOOSE_ROTATION**2
+    covariance[:, 3:, 3:] = noise.position_factor * (np.swapaxes(R, 1, 2) @ noise.position_covariance[rows[k]] @ R)
+    share = np.concatenate([np.ones(len(plain)), modes.responsibility])
+    return ObservationFactors(frame[k], landmark[k], make_pose(R, table.position[rows[k]]), covariance, weight[k] * share)
 
 
 def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.NonlinearFactorGraph:
@@ -137,10 +127,14 @@ def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.Nonlinear
     graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(problem.odometry[0]),
                                      gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE)))
     steps = relative(problem.odometry[:-1], problem.odometry[1:])
-    for i, (step, rotation, translation) in enumerate(zip(steps, noise.rotation_step, noise.translation_step)):
-        sigmas = np.array([rotation] * 3 + [translation] * 3)
-        graph.add(gtsam.BetweenFactorPose3(pose_key(i), pose_key(i + 1), gtsam.Pose3(step),
-                                           gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    for i, step in enumerate(steps):
+        sigmas = np.repeat([noise.rotation_step[i], noise.translation_step[i]], 3)
+        model: gtsam.noiseModel.Base
+        if noise.step_correlation is None:
+            model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        else:
+            model = gtsam.noiseModel.Gaussian.Covariance(sigmas[:, None] * noise.step_correlation[i] * sigmas)
+        graph.add(gtsam.BetweenFactorPose3(pose_key(i), pose_key(i + 1), gtsam.Pose3(step), model))
     return graph
 
 

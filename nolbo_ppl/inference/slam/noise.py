@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from nolbo_ppl.data.observations import ObservationTable
 from nolbo_ppl.geometry.pose import relative, so3_log, transform
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
-from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import nearest_of_modes, observed_modes, resolved_symmetry
 
 MAD_TO_SCALE = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
@@ -120,8 +120,7 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     covariance = _position_covariance(table, pairs, config, report, warnings)
     rotation_scale = _rotation_scale(problem, pairs, config, report, warnings)
     latent_scale = _latent_scale(table, pairs, config, report, warnings)
-    length = np.linalg.norm(np.diff(problem.odometry[:, :3, 3], axis=0), axis=1)
-    rotation_step, translation_step = odometry_scales(length, config)
+    rotation_step, translation_step, correlation = step_scales(problem, config)
     volume = view_volume(table)
     seen = max(len(np.unique(table.frame)), 1)
     rate = len(table) / seen / volume if len(table) else 1.0
@@ -130,8 +129,22 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
         rotation_scale=rotation_scale, latent_scale=latent_scale,
         new_rate=config.new_rate if config.new_rate is not None else 0.2 * rate,
         clutter_rate=config.clutter_rate if config.clutter_rate is not None else 0.1 * rate,
-        report=report, warnings=tuple(warnings),
+        report=report, warnings=tuple(warnings), step_correlation=correlation,
     )
+
+
+def step_scales(
+    problem: SlamProblem, config: SlamConfig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 6 6"] | None]:
+    """Scales of each step, and its covariance in units of them where the problem states it."""
+    covariance = problem.odometry_covariance
+    if covariance is None:
+        length = np.linalg.norm(np.diff(problem.odometry[:, :3, 3], axis=0), axis=1)
+        return *odometry_scales(length, config), None
+    rotation, translation = (np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3)
+                             for part in (slice(3), slice(3, 6)))
+    scale = np.repeat(np.stack([rotation, translation], axis=1), 3, axis=1)
+    return rotation, translation, covariance / scale[:, :, None] / scale[:, None, :]
 
 
 def odometry_scales(
@@ -213,7 +226,7 @@ def _rotation_scale(
             relative(problem.odometry[table.frame[j]], problem.odometry[table.frame[i]])[:, :3, :3] @ table.rotation[i]
         )
         symmetry = resolved_symmetry(table, config)
-        observed = nearest_mode_rotation(carried, table.rotation[j], symmetry[j])
+        observed = nearest_of_modes(carried, observed_modes(table, np.ones(len(table)), j), symmetry[j])
         error = so3_log(np.swapaxes(carried, 1, 2) @ observed)
         error[symmetry[j] == 0, 2] = np.nan
         values = error[np.isfinite(error)]

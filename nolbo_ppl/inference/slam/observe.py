@@ -14,7 +14,7 @@ from nolbo_ppl.inference.slam.evidence import TrackletFeatures
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features
 from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import Estimate, Linearisation
-from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, orientation_log_density, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density, observed_modes, resolved_symmetry
 
 GATE = 25.0
 """Squared Mahalanobis distance beyond which a detection is no candidate for a landmark."""
@@ -67,9 +67,9 @@ def associate_detections(
         predicted = (
             np.swapaxes(estimate.T_world_camera[table.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
         )
-        scale = np.sqrt(noise.rotation_scale[k] ** 2 + 0.02**2)
-        value[both] += orientation_log_density(predicted, table.rotation[k], scale, resolved_symmetry(table, config)[k],
-                                               config) - UNIFORM_LOG_DENSITY
+        scale = np.sqrt(noise.rotation_scale**2 + 0.02**2)
+        modes = observed_modes(table, scale, k)
+        value[both] += mixture_log_density(predicted, modes, resolved_symmetry(table, config)[k], config) - UNIFORM_LOG_DENSITY
     return _marginals(table.frame, rows, landmarks, value, log_null, log_new, n, m, config)
 
 

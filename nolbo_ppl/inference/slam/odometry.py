@@ -31,8 +31,10 @@ LARGEST_FACTOR = 64.0
 """And never beyond this multiple."""
 
 
-def stated_scales(config: SlamConfig) -> tuple[bool, bool]:
+def stated_scales(problem: SlamProblem, config: SlamConfig) -> tuple[bool, bool]:
     """Whether the user stated the rotation and the translation scale."""
+    if problem.odometry_covariance is not None:
+        return True, True
     return config.odometry_rotation_scale is not None, (
         config.odometry_translation_scale is not None or config.odometry_translation_ratio is not None)
 
@@ -83,7 +85,7 @@ def log_evidence(window: SlamState, rotation: float, translation: float) -> floa
 
 def odometry_by_evidence(state: SlamState) -> SlamState:
     """Scale factors of the odometry (where not stated) that the tracked objects make most probable, by coordinate search."""
-    stated_rotation, stated_translation = stated_scales(state.config)
+    stated_rotation, stated_translation = stated_scales(state.problem, state.config)
     free = [not stated_rotation, not stated_translation]
     window = densest_window(state) if any(free) else state
     if not any(free) or len(window.rows) < 20 or len(window.problem) < 10:
@@ -145,7 +147,7 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
     factors = []
     report, warnings = dict(state.noise.report), list(state.noise.warnings)
     ratios = residual_ratios(state, linearisation)
-    for name, stated, ratio in zip(("rotation", "translation"), stated_scales(state.config), ratios):
+    for name, stated, ratio in zip(("rotation", "translation"), stated_scales(state.problem, state.config), ratios):
         factor = max(ratio, 1.0)
         if stated:
             factor = 1.0

@@ -9,34 +9,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.data.observations import ObservationTable, concatenate
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
-from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
 from nolbo_ppl.inference.slam.drift import DriftGraph
 from nolbo_ppl.inference.slam.em import link_arrays
 from nolbo_ppl.inference.slam.evidence import TrackletFeatures
 from nolbo_ppl.inference.slam.features import detection_features, fit_prior, fuse_latent
-from nolbo_ppl.inference.slam.finish import finish
-from nolbo_ppl.inference.slam.graph import (
-    GAUGE_SCALE,
-    Estimate,
-    add_landmark_priors,
-    add_observation_factors,
-    landmark_key,
-    named_error,
-    pose_key,
-    resolve_observations,
-)
-from nolbo_ppl.inference.slam.noise import estimate_noise
+from nolbo_ppl.inference.slam.graph import Estimate
+from nolbo_ppl.inference.slam.noise import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
+from nolbo_ppl.inference.slam.online_graph import OnlineGraph
 from nolbo_ppl.inference.slam.online_loops import Track, find_links, track_samples
-from nolbo_ppl.inference.slam.orientation import resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.result import SlamResult
-from nolbo_ppl.inference.slam.solve import iterate
+from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.state import init, init_from_tracklets
 from nolbo_ppl.inference.slam.state_types import link_scale
 from nolbo_ppl.inference.slam.tracklets import Tracker, summarise_tracks
@@ -79,25 +69,23 @@ class ObjectSlam:
         self.drift = DriftGraph()
         self.fresh: list[int] = []
         self.pending: dict[int, list[tuple[int, SlamProblem, NoiseModel, int]]] = {}
-        self.graph = gtsam.NonlinearFactorGraph()
-        self.values = gtsam.Values()
-        parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(0.05)
-        parameters.relinearizeSkip = 5
-        # Landmarks hang on weak priors beside a nearly fixed first pose: QR takes that spread, Cholesky does not.
-        parameters.setFactorization("QR")
-        self.isam = gtsam.ISAM2(parameters)
+        self.graph = OnlineGraph()
+        self.step_covariances: list[np.ndarray] = []
         self.T_world_camera = np.eye(4)
         self.seen = 0
 
     # -- one keyframe -------------------------------------------------------------------------------------------------
 
-    def update(self, odometry: Float[np.ndarray, "4 4"], observations: ObservationTable) -> OnlineInfo:
+    def update(
+        self, odometry: Float[np.ndarray, "4 4"], observations: ObservationTable,
+        odometry_covariance: Float[np.ndarray, "6 6"] | None = None,
+    ) -> OnlineInfo:
         """Take the next keyframe.
 
         Args:
             odometry: its T_world_camera as odometry has it.
             observations: its detections; their frame numbers are ignored.
+            odometry_covariance: of the step that led here (see `SlamProblem`), for all keyframes after the first or for none.
 
         Raises:
             InputError: odometry or observations are malformed.
@@ -106,11 +94,15 @@ class ObjectSlam:
         if odometry.shape != (4, 4) or not np.isfinite(odometry).all() or not is_rotation(odometry[:3, :3]):
             raise input_error("odometry is no pose", got=odometry, expected="a finite 4 x 4 rigid motion")
         frame = len(self.odometry)
+        if frame and odometry_covariance is not None:
+            check_step_covariance(np.asarray(odometry_covariance)[None], 1)
+        if frame > 1 and (odometry_covariance is None) == bool(self.step_covariances):
+            raise input_error("odometry_covariance is given for some keyframes only", do="give it for all or for none")
         table = replace(observations, frame=np.zeros(len(observations), dtype=np.int64))
         problem = SlamProblem(odometry[None], table)  # checks the detections
         self._begin(table)
         noise = self._noise(problem)
-        rotation, translation = self._add_pose(odometry, frame)
+        rotation, translation = self._add_pose(odometry, frame, odometry_covariance)
         assigned, weight = self._track(table, noise, odometry, frame, rotation, translation)
         start = self.seen
         self.odometry.append(odometry)
@@ -120,11 +112,9 @@ class ObjectSlam:
         self.seen += len(table)
         self._remember(table, noise, assigned, start, odometry, frame)
         self._add_factors(problem, noise, assigned, odometry, frame)
-        self._commit()
-        self.T_world_camera = self.isam.calculateEstimatePose3(pose_key(frame)).matrix()
+        self.graph.commit()
         closings = self._close(frame, noise)
-        if closings:
-            self.T_world_camera = self.isam.calculateEstimatePose3(pose_key(frame)).matrix()
+        self.T_world_camera = self.graph.pose(frame)
         return OnlineInfo(frame, self.T_world_camera, len(self.track_of_landmark), closings)
 
     def _begin(self, table: ObservationTable) -> None:
@@ -176,27 +166,32 @@ class ObjectSlam:
         noise = estimate_noise(problem, self.config)
         return replace(noise, position_factor=self.factors[0], rotation_factor=self.factors[1])
 
-    def _add_pose(self, odometry: np.ndarray, frame: int) -> tuple[float, float]:
+    def _add_pose(self, odometry: np.ndarray, frame: int, covariance: np.ndarray | None) -> tuple[float, float]:
         """Odometry factor and first value of the new pose; scales of the step."""
         if frame == 0:
             self.T_world_camera = odometry
-            self.graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(odometry),
-                                                  gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE)))
-            self.values.insert(pose_key(0), gtsam.Pose3(odometry))
+            self.graph.add_first_pose(odometry)
             return 0.0, 0.0
         step = inverse(self.odometry[-1]) @ odometry
-        config, length = self.config, float(np.linalg.norm(step[:3, 3]))
-        rotation = config.odometry_rotation_scale or 0.004
-        constant, ratio = config.odometry_translation_scale, config.odometry_translation_ratio
-        if constant is None and ratio is None:
-            ratio = 0.02
-        translation = max(float(np.hypot(constant or 0.0, (ratio or 0.0) * length)), 1e-4)
+        if covariance is None:
+            covariance = self._step_covariance(float(np.linalg.norm(step[:3, 3])))
+        else:
+            self.step_covariances.append(np.asarray(covariance, dtype=np.float64))
         self.T_world_camera = self.T_world_camera @ step
-        model = gtsam.noiseModel.Diagonal.Sigmas(np.array([rotation] * 3 + [translation] * 3))
-        self.graph.add(gtsam.BetweenFactorPose3(pose_key(frame - 1), pose_key(frame), gtsam.Pose3(step), model))
-        self.values.insert(pose_key(frame), gtsam.Pose3(self.T_world_camera))
+        self.graph.add_pose(step, covariance, self.T_world_camera)
+        rotation, translation = (float(np.sqrt(np.trace(covariance[part, part]) / 3)) for part in (slice(3), slice(3, 6)))
         self.drift.advance(self.T_world_camera, rotation, translation)
         return rotation, translation
+
+    def _step_covariance(self, length: float) -> np.ndarray:
+        """Covariance of an odometry step of this length where none is stated."""
+        config = self.config
+        rotation = config.odometry_rotation_scale or DEFAULT_ROTATION_STEP
+        constant, ratio = config.odometry_translation_scale, config.odometry_translation_ratio
+        if constant is None and ratio is None:
+            ratio = DEFAULT_TRANSLATION_RATIO
+        translation = max(float(np.hypot(constant or 0.0, (ratio or 0.0) * length)), 1e-4)
+        return np.diag(np.repeat([rotation**2, translation**2], 3))
 
     def _track(
         self,
@@ -218,8 +213,8 @@ class ObjectSlam:
         return tracker.associate(
             transform(odometry, table.position),
             R @ noise.position_covariance @ R.T,
-            np.where(table.has_rotation[:, None, None], R @ np.nan_to_num(table.rotation), np.eye(3)),
-            np.where(table.has_rotation, noise.rotation_scale, np.nan),
+            observed_modes(table, noise.rotation_scale).turned(R),
+            table.has_rotation,
             resolved_symmetry(table, self.config),
             latent,
             variance,
@@ -270,44 +265,18 @@ class ObjectSlam:
             if track.landmark < 0:
                 self._found(track, number, problem.observations, i)
                 for earlier, its_problem, its_noise, k in self.pending.pop(number, []):
-                    pose = self.isam.calculateEstimatePose3(pose_key(earlier)).matrix()
-                    self._observe(its_problem, its_noise, k, earlier, pose, track.landmark)
-            self._observe(problem, noise, i, frame, self.T_world_camera, track.landmark)
+                    self.graph.observe(its_problem, its_noise, self.config, k, earlier, self.graph.pose(earlier), track.landmark)
+            self.graph.observe(problem, noise, self.config, i, frame, self.T_world_camera, track.landmark)
         for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
             del self.pending[number]
 
     def _found(self, track: Track, number: int, table: ObservationTable, i: int) -> None:
         """A new landmark at its latest detection, with its weak prior."""
-        track.landmark = len(self.track_of_landmark)
-        self.track_of_landmark.append(number)
-        self.fresh.append(track.landmark)
         R = self.T_world_camera[:3, :3] @ table.rotation[i] if np.isfinite(table.rotation[i, 0, 0]) else np.eye(3)
         T = make_pose(R, transform(self.T_world_camera, table.position[i]))
-        self.values.insert(landmark_key(track.landmark), gtsam.Pose3(T))
-        add_landmark_priors(self.graph, T[None], float(np.linalg.norm(table.position[i])), first=track.landmark)
-
-    def _observe(
-        self, problem: SlamProblem, noise: NoiseModel, i: int, frame: int, T_world_camera: np.ndarray, landmark: int
-    ) -> None:
-        estimate = Estimate(T_world_camera[None], self._landmark(landmark)[None])
-        factors = resolve_observations(
-            problem, noise, self.config, estimate, np.array([i]), np.zeros(1, dtype=np.int64), np.ones(1)
-        )
-        add_observation_factors(self.graph, replace(factors, frame=np.array([frame]), landmark=np.array([landmark])))
-
-    def _landmark(self, number: int) -> np.ndarray:
-        key = landmark_key(number)
-        if self.values.exists(key):
-            return self.values.atPose3(key).matrix()
-        return self.isam.calculateEstimatePose3(key).matrix()
-
-    def _commit(self) -> None:
-        try:
-            self.isam.update(self.graph, self.values)
-        except RuntimeError as error:
-            raise named_error(error) from None
-        self.graph = gtsam.NonlinearFactorGraph()
-        self.values = gtsam.Values()
+        track.landmark = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])))
+        self.track_of_landmark.append(number)
+        self.fresh.append(track.landmark)
 
     # -- loops --------------------------------------------------------------------------------------------------------
 
@@ -320,7 +289,7 @@ class ObjectSlam:
         self.fresh = [j for j in self.fresh if j not in set(ended)]
         window = np.unique([*ended, *range(max(min(ended) - half, 0), min(ended))])
         tracks = [self.tracks[number] for number in self.track_of_landmark]
-        poses = np.array([self._landmark(j) for j in range(len(tracks))])
+        poses = np.array([self.graph.landmark(j) for j in range(len(tracks))])
         rng = np.random.default_rng([self.config.seed, frame])
         samples = track_samples(poses, tracks, noise, self.drift, self.config.samples, rng)
         floor = link_scale(noise)
@@ -340,23 +309,17 @@ class ObjectSlam:
     ) -> None:
         pairs = np.array(found, dtype=np.int64)
         links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
-        for k, (i, j) in enumerate(found):
-            model = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(links.scale[k], 3))
-            self.graph.add(
-                gtsam.BetweenFactorPose3(landmark_key(i), landmark_key(j), gtsam.Pose3(links.T_a_b[k]), model)
-            )
+        for i, j in found:
             self.drift.close((tracks[i].first + tracks[i].last) // 2, (tracks[j].first + tracks[j].last) // 2,
                              poses[j, :3, 3], 2 * scale)
         self.links += found
-        self._commit()
-        self.isam.update()
+        self.graph.link(links)
 
     # -- answers ------------------------------------------------------------------------------------------------------
 
     def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
         """All poses as iSAM2 has them now."""
-        values = self.isam.calculateEstimate()
-        return np.array([values.atPose3(pose_key(i)).matrix() for i in range(len(self.odometry))])
+        return self.graph.trajectory()
 
     def finish(self) -> SlamResult:
         """Batch EM on the tracks gathered: the final trajectory and map.
@@ -366,24 +329,26 @@ class ObjectSlam:
         """
         if not self.odometry:
             raise input_error("no keyframe was given", do="call update first")
-        problem = SlamProblem(np.array(self.odometry), concatenate(self.tables))
+        covariance = np.array(self.step_covariances) if self.step_covariances else None
+        problem = SlamProblem(np.array(self.odometry), concatenate(self.tables), covariance)
         noise = estimate_noise(problem, self.config)
         prior = fit_prior(problem.observations, self.config)
         tracklets = summarise_tracks(
             problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights)
         )
         state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
-        state, infos = iterate(state)
-        state, associations = finish(state)
-        return SlamResult(state=state, associations=associations, infos=infos)
+        return complete(state)
 
 
 def solve_online(problem: SlamProblem, config: SlamConfig | None = None, calibration_frames: int = 200) -> SlamResult:
     """Feed a whole problem keyframe by keyframe; scales nobody stated come from its first frames."""
     first = problem.observations.select(problem.observations.frame < calibration_frames)
-    slam = ObjectSlam(config, calibration=SlamProblem(problem.odometry[:calibration_frames], first))
+    covariance = problem.odometry_covariance
+    part = None if covariance is None else covariance[: calibration_frames - 1]
+    slam = ObjectSlam(config, calibration=SlamProblem(problem.odometry[:calibration_frames], first, part))
     order = np.argsort(problem.observations.frame, kind="stable")
     bounds = np.searchsorted(problem.observations.frame[order], np.arange(len(problem) + 1))
     for t in range(len(problem)):
-        slam.update(problem.odometry[t], problem.observations.select(order[bounds[t] : bounds[t + 1]]))
+        step = None if covariance is None or not t else covariance[t - 1]
+        slam.update(problem.odometry[t], problem.observations.select(order[bounds[t] : bounds[t + 1]]), step)
     return slam.finish()

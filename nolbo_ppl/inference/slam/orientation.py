@@ -1,6 +1,13 @@
-"""Orientation likelihoods with several modes: symmetry group, 180-degree flips and an uninformative part."""
+"""Orientation likelihoods with several modes: those a detector states, symmetry group, half turns, an uninformative part.
+
+An observed orientation is a mixture of modes; each of them stands for its orbit under the object's symmetry and, with a
+small probability, for its half turn about the vertical axis. The E-step uses the density of the whole mixture; the M-step
+splits a factor by the responsibilities of what is left of it (`resolve_modes`).
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +18,42 @@ from nolbo_ppl.inference.slam.config import SlamConfig
 
 UNIFORM_LOG_DENSITY = -np.log(8.0 * np.pi**2)
 """Log density of the uniform distribution on SO(3) with respect to rotation vectors at the identity, rad^-3."""
+SURE_MODE = 0.99
+"""A mode with this responsibility is kept alone."""
 _MAXIMUM_ORDER = 8
+_Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class RotationModes:
+    """Modes of observed orientations, padded to the same number."""
+
+    log_weight: Float[np.ndarray, "n K"]
+    """Log weights, -inf where there are fewer."""
+    R: Float[np.ndarray, "n K 3 3"]
+    """Rotations."""
+    scale: Float[np.ndarray, "n K"]
+    """Standard deviation of each angle, rad."""
+
+    def __len__(self) -> int:
+        return len(self.log_weight)
+
+    def select(self, rows: np.ndarray) -> RotationModes:
+        """Some of the rows."""
+        return RotationModes(self.log_weight[rows], self.R[rows], self.scale[rows])
+
+    def turned(self, R: Float[np.ndarray, "... 3 3"]) -> RotationModes:
+        """The same in another frame: every mode multiplied by R (one, or one a row) from the left."""
+        return RotationModes(self.log_weight, (R[:, None] if R.ndim == 3 else R) @ self.R, self.scale)
+
+    def padded(self, count: int) -> RotationModes:
+        """With room for `count` modes."""
+        n, more = len(self), count - self.log_weight.shape[1]
+        if more <= 0:
+            return self
+        return RotationModes(np.concatenate([self.log_weight, np.full((n, more), -np.inf)], axis=1),
+                             np.concatenate([self.R, np.tile(np.eye(3), (n, more, 1, 1))], axis=1),
+                             np.concatenate([self.scale, np.ones((n, more))], axis=1))
 
 
 def resolved_symmetry(table: ObservationTable, config: SlamConfig) -> Int[np.ndarray, " n"]:
@@ -20,13 +62,46 @@ def resolved_symmetry(table: ObservationTable, config: SlamConfig) -> Int[np.nda
     return np.where(table.symmetry >= 0, table.symmetry, by_category.reshape(len(table)))
 
 
+def observed_modes(
+    table: ObservationTable, rotation_scale: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"] | None = None
+) -> RotationModes:
+    """Modes of the given detections: as stated, else one at the observed rotation (the identity where there is none).
+
+    Stated scales of modes are corrected as those of the best mode were (`rotation_scale` over the table's).
+    """
+    rows = np.arange(len(table)) if rows is None else rows
+    n, count = len(rows), max(table.modes, 1)
+    oriented = table.has_rotation[rows]
+    log_weight = np.full((n, count), -np.inf)
+    log_weight[:, 0] = 0.0
+    R, scale = np.tile(np.eye(3), (n, count, 1, 1)), np.ones((n, count))
+    R[oriented, 0] = table.rotation[rows[oriented]]
+    scale[:, 0] = rotation_scale[rows]
+    if table.modes:
+        weight = table.mode_weight[rows]
+        k = np.flatnonzero(oriented & (weight.sum(axis=1) > 0))
+        with np.errstate(divide="ignore"):
+            log_weight[k] = np.log(weight[k] / weight[k].sum(axis=1, keepdims=True))
+        stated = table.rotation_scale[rows[k]]
+        correction = np.where(np.isfinite(stated), rotation_scale[rows[k]] / np.where(np.isfinite(stated), stated, 1.0), 1.0)
+        R[k], scale[k] = table.mode_rotation[rows[k]], table.mode_std[rows[k]] * correction[:, None]
+    return RotationModes(log_weight, R, scale)
+
+
 def vertical_turns(order: int) -> Float[np.ndarray, "g 3 3"]:
     """Rotations about the object's vertical axis that an n-fold symmetry cannot tell apart, and their half turns."""
     order = min(max(order, 1), _MAXIMUM_ORDER)
     angles = 2 * np.pi * np.arange(order) / order
     if order % 2:
         angles = np.concatenate([angles, angles + np.pi])
-    return so3_exp(angles[:, None] * np.array([0.0, 0.0, 1.0]))
+    return so3_exp(angles[:, None] * _Z)
+
+
+def turn_shares(order: int, turns: int, config: SlamConfig) -> Float[np.ndarray, " g"]:
+    """Prior weight of each of the `vertical_turns`."""
+    group = min(max(order, 1), _MAXIMUM_ORDER)
+    flip = config.flip_probability if turns > group else 0.0
+    return np.where(np.arange(turns) < group, (1 - flip) / group, flip / max(turns - group, 1))
 
 
 def _free_alignment(R_predicted: np.ndarray, R_observed: np.ndarray) -> np.ndarray:
@@ -44,8 +119,7 @@ def nearest_mode_rotation(
         rows = np.flatnonzero(symmetry == order)
         predicted, observed = R_predicted[rows], R_observed[rows]
         if order == 0:
-            angle = _free_alignment(predicted, observed)
-            out[rows] = observed @ so3_exp(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+            out[rows] = observed @ so3_exp(_free_alignment(predicted, observed)[:, None] * _Z)
             continue
         candidates = observed[:, None] @ vertical_turns(int(order))[None]
         closeness = np.einsum("nij,ngij->ng", predicted, candidates)
@@ -53,33 +127,103 @@ def nearest_mode_rotation(
     return out
 
 
+def nearest_of_modes(
+    R_predicted: Float[np.ndarray, "n 3 3"], modes: RotationModes, symmetry: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """The equivalent, over all modes of each observed orientation, that is closest to the predicted one."""
+    n, count = modes.log_weight.shape
+    turned = nearest_mode_rotation(np.repeat(R_predicted, count, axis=0), modes.R.reshape(-1, 3, 3), np.repeat(symmetry, count))
+    closeness = np.einsum("nij,nkij->nk", R_predicted, turned.reshape(n, count, 3, 3))
+    best = np.argmax(np.where(np.isfinite(modes.log_weight), closeness, -np.inf), axis=1)
+    return turned.reshape(n, count, 3, 3)[np.arange(n), best]
+
+
+def _turned(
+    predicted: np.ndarray, observed: np.ndarray, scale: np.ndarray, order: int, config: SlamConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """All turns [r, g, 3, 3] of observed rotations of one symmetry order, and their log densities [r, g], weights included.
+
+    Each is normal in the rotation vector; a free axis is integrated out (its angle is uniform).
+    """
+    if order == 0:
+        aligned = observed @ so3_exp(_free_alignment(predicted, observed)[:, None] * _Z)
+        tilt = so3_log(np.swapaxes(predicted, 1, 2) @ aligned)[:, :2]
+        log_density = -0.5 * np.sum(tilt**2, axis=1) / scale**2 - np.log(2 * np.pi * scale**2) - np.log(2 * np.pi)
+        return aligned[:, None], log_density[:, None]
+    turns = vertical_turns(order)
+    rotations = observed[:, None] @ turns[None]
+    error = so3_log(np.swapaxes(predicted, 1, 2)[:, None] @ rotations)
+    s = scale[:, None]
+    with np.errstate(divide="ignore"):
+        log_share = np.log(turn_shares(order, len(turns), config))
+    return rotations, log_share - 0.5 * np.sum(error**2, axis=2) / s**2 - 1.5 * np.log(2 * np.pi * s**2)
+
+
 def orientation_log_density(
     R_predicted: Float[np.ndarray, "n 3 3"], R_observed: Float[np.ndarray, "n 3 3"], scale: Float[np.ndarray, " n"],
     symmetry: Int[np.ndarray, " n"], config: SlamConfig,
 ) -> Float[np.ndarray, " n"]:
-    """Log density of observed rotations: a mixture over symmetry, half turns and a uniform part, rad^-3.
-
-    Each mode is normal in the rotation vector; a free axis is integrated out (its angle is uniform).
-    """
+    """Log density of observed rotations of one mode: a mixture over symmetry, half turns and a uniform part, rad^-3."""
     out = np.full(len(R_predicted), -np.inf)
     outlier = np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY
     for order in np.unique(symmetry):
         rows = np.flatnonzero(symmetry == order)
-        predicted, observed, s = R_predicted[rows], R_observed[rows], scale[rows]
-        if order == 0:
-            angle = _free_alignment(predicted, observed)
-            aligned = observed @ so3_exp(angle[:, None] * np.array([0.0, 0.0, 1.0]))
-            tilt = so3_log(np.swapaxes(predicted, 1, 2) @ aligned)[:, :2]
-            log_mode = -0.5 * np.sum(tilt**2, axis=1) / s**2 - np.log(2 * np.pi * s**2) - np.log(2 * np.pi)
-            out[rows] = np.logaddexp(np.log1p(-config.orientation_outlier) + log_mode, outlier)
-            continue
-        turns = vertical_turns(int(order))
-        group = int(order)
-        weight = np.full(len(turns), config.flip_probability / max(len(turns) - group, 1))
-        weight[:group] = (1 - (config.flip_probability if len(turns) > group else 0.0)) / group
-        error = so3_log(np.swapaxes(predicted, 1, 2)[:, None] @ observed[:, None] @ turns[None])
-        log_modes = (np.log(weight) - 0.5 * np.sum(error**2, axis=2) / s[:, None] ** 2
-                     - 1.5 * np.log(2 * np.pi * s[:, None] ** 2))
-        best = np.logaddexp.reduce(log_modes, axis=1)
-        out[rows] = np.logaddexp(np.log1p(-config.orientation_outlier) + best, outlier)
+        _, log_modes = _turned(R_predicted[rows], R_observed[rows], scale[rows], int(order), config)
+        out[rows] = np.logaddexp(np.log1p(-config.orientation_outlier) + np.logaddexp.reduce(log_modes, axis=1), outlier)
     return out
+
+
+def mixture_log_density(
+    R_predicted: Float[np.ndarray, "n 3 3"], modes: RotationModes, symmetry: Int[np.ndarray, " n"], config: SlamConfig
+) -> Float[np.ndarray, " n"]:
+    """Log density of observed orientations with all their modes, rad^-3."""
+    n, count = modes.log_weight.shape
+    by_mode = orientation_log_density(np.repeat(R_predicted, count, axis=0), modes.R.reshape(-1, 3, 3), modes.scale.ravel(),
+                                      np.repeat(symmetry, count), config).reshape(n, count)
+    return np.logaddexp.reduce(modes.log_weight + by_mode, axis=1)
+
+
+@dataclass(frozen=True)
+class ResolvedModes:
+    """What an observed orientation says given a prediction: a weighted list of rotations."""
+
+    row: Int[np.ndarray, " g"]
+    """Detection of each."""
+    R: Float[np.ndarray, "g 3 3"]
+    """Rotation, turned as the symmetry allows; the predicted one for the uninformative part."""
+    scale: Float[np.ndarray, " g"]
+    """Standard deviation of each angle, rad; infinite for the uninformative part."""
+    responsibility: Float[np.ndarray, " g"]
+    """Share of each, summing to one over a detection."""
+
+
+def resolve_modes(
+    R_predicted: Float[np.ndarray, "n 3 3"], modes: RotationModes, symmetry: Int[np.ndarray, " n"], config: SlamConfig,
+    *, minimum: float = 1e-3,
+) -> ResolvedModes:
+    """Responsibilities of all modes, turns and the uninformative part; one with `SURE_MODE` stands alone.
+
+    Parts below `minimum` are left out and their share goes to the rest.
+    """
+    n, count = modes.log_weight.shape
+    row, rotation, scale, log_joint = [np.arange(n)], [R_predicted], [np.full(n, np.inf)], [
+        np.full(n, np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY)]
+    for order in np.unique(symmetry):
+        rows = np.flatnonzero(symmetry == order)
+        repeated = np.repeat(rows, count)
+        R, value = _turned(R_predicted[repeated], modes.R[rows].reshape(-1, 3, 3), modes.scale[rows].ravel(), int(order), config)
+        turns = R.shape[1]
+        row.append(np.repeat(repeated, turns))
+        rotation.append(R.reshape(-1, 3, 3))
+        scale.append(np.repeat(modes.scale[rows].ravel(), turns))
+        log_joint.append((value + modes.log_weight[rows].reshape(-1, 1)).ravel() + np.log1p(-config.orientation_outlier))
+    rows, value = np.concatenate(row), np.concatenate(log_joint)
+    total = np.full(n, -np.inf)
+    np.logaddexp.at(total, rows, value)
+    share = np.exp(value - total[rows])
+    sure = np.zeros(n)
+    np.maximum.at(sure, rows, share)
+    keep = np.where(sure[rows] >= SURE_MODE, share >= SURE_MODE, share >= minimum)
+    rows, share = rows[keep], share[keep]
+    share = share / np.bincount(rows, weights=share, minlength=n)[rows]
+    return ResolvedModes(rows, np.concatenate(rotation)[keep], np.concatenate(scale)[keep], share)

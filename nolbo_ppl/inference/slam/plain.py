@@ -31,7 +31,7 @@ from nolbo_ppl.inference.slam.graph import (
     to_values,
 )
 from nolbo_ppl.inference.slam.noise import estimate_noise
-from nolbo_ppl.inference.slam.orientation import resolved_symmetry, vertical_turns
+from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry, turn_shares, vertical_turns
 
 SMALLEST_WEIGHT = 1e-12
 """Weights below this are left out of the M-step."""
@@ -90,9 +90,10 @@ class PlainInfo:
 
 
 def split_modes(problem: SlamProblem, noise: NoiseModel, config: SlamConfig) -> Modes:
-    """All orientation modes of all detections: symmetry, half turn, and one that says nothing."""
+    """All orientation modes of all detections: those stated, symmetry, half turn, and one that says nothing."""
     table = problem.observations
     symmetry = resolved_symmetry(table, config)
+    stated = observed_modes(table, noise.rotation_scale)
     rows, weights, rotations, scales = [], [], [], []
     for k in range(len(table)):
         if not table.has_rotation[k]:
@@ -103,17 +104,18 @@ def split_modes(problem: SlamProblem, noise: NoiseModel, config: SlamConfig) -> 
             continue
         order = int(symmetry[k])
         turns = vertical_turns(order) if order else np.eye(3)[None]
-        group = order if order else 1
-        flip = config.flip_probability if len(turns) > group else 0.0
-        for g, turn in enumerate(turns):
-            share = (1 - flip) / group if g < group else flip / (len(turns) - group)
-            scale = np.full(3, noise.rotation_scale[k])
-            if order == 0:
-                scale[2] = LOOSE_ROTATION
-            rows.append(k)
-            weights.append(np.log1p(-config.orientation_outlier) + np.log(max(share, 1e-300)))
-            rotations.append(table.rotation[k] @ turn)
-            scales.append(scale)
+        shares = turn_shares(order, len(turns), config) if order else np.ones(1)
+        for log_weight, R_mode, angle in zip(stated.log_weight[k], stated.R[k], stated.scale[k]):
+            if not np.isfinite(log_weight):
+                continue
+            for share, turn in zip(shares, turns):
+                scale = np.full(3, angle)
+                if order == 0:
+                    scale[2] = LOOSE_ROTATION
+                rows.append(k)
+                weights.append(np.log1p(-config.orientation_outlier) + log_weight + np.log(max(share, 1e-300)))
+                rotations.append(R_mode @ turn)
+                scales.append(scale)
         rows.append(k)
         weights.append(np.log(config.orientation_outlier))
         rotations.append(table.rotation[k])

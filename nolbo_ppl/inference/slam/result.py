@@ -14,7 +14,7 @@ from nolbo_ppl.inference.slam.em import StepInfo
 from nolbo_ppl.inference.slam.features import LARGE_VARIANCE, category_index
 from nolbo_ppl.inference.slam.finish import final_graph
 from nolbo_ppl.inference.slam.gaussian import log_normal
-from nolbo_ppl.inference.slam.graph import Linearisation, linearise
+from nolbo_ppl.inference.slam.graph import Estimate, Linearisation, linearise
 from nolbo_ppl.inference.slam.observe import Associations
 from nolbo_ppl.inference.slam.shapes import LatentDecoder, Voxels, decode_landmarks
 from nolbo_ppl.inference.slam.state_types import SlamState
@@ -69,6 +69,8 @@ class SlamResult:
     """One record an iteration."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time by phase."""
+    history: tuple[Estimate, ...] = ()
+    """Poses and landmarks of every iteration: odometry first, the result last."""
 
     @property
     def T_world_camera(self) -> Float[np.ndarray, "n 4 4"]:

@@ -10,7 +10,7 @@ from nolbo_ppl.inference.slam.config import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.em import StepInfo, step
 from nolbo_ppl.inference.slam.finish import finish
 from nolbo_ppl.inference.slam.result import SlamResult
-from nolbo_ppl.inference.slam.state import SlamState, init
+from nolbo_ppl.inference.slam.state import SlamState, first_estimate, init
 
 
 def iterate(
@@ -49,19 +49,26 @@ def solve(
         GraphError: GTSAM could not solve the graph; names pose or landmark.
     """
     config = config or SlamConfig()
-    seconds = {}
-    clock = time.perf_counter()
-
-    def lap(name: str) -> None:
-        nonlocal clock
-        now = time.perf_counter()
-        seconds[name] = now - clock
-        clock = now
-
+    start = time.perf_counter()
     state = init(problem, config)
-    lap("tracklets")
-    state, infos = iterate(state, on_step)
-    lap("em")
+    seconds = {"tracklets": time.perf_counter() - start}
+    result = complete(state, on_step)
+    return replace(result, seconds=seconds | result.seconds)
+
+
+def complete(state: SlamState, on_step: Callable[[SlamState, StepInfo], None] | None = None) -> SlamResult:
+    """Iterate a state, finish it, and keep what every iteration held."""
+    start = first_estimate(state.problem, state.noise, state.config, state.rows, state.landmark, len(state.static))
+    history = [start]
+
+    def record(state: SlamState, info: StepInfo) -> None:
+        history.append(state.estimate)
+        if on_step is not None:
+            on_step(state, info)
+
+    clock = time.perf_counter()
+    state, infos = iterate(state, record)
+    middle = time.perf_counter()
     state, associations = finish(state)
-    lap("map")
-    return SlamResult(state=replace(state), associations=associations, infos=infos, seconds=seconds)
+    seconds = {"em": middle - clock, "map": time.perf_counter() - middle}
+    return SlamResult(state=state, associations=associations, infos=infos, seconds=seconds, history=(*history, state.estimate))

@@ -28,7 +28,7 @@ from nolbo_ppl.inference.slam.graph import (
 )
 from nolbo_ppl.inference.slam.noise import estimate_noise
 from nolbo_ppl.inference.slam.odometry import odometry_by_evidence, stated_scales
-from nolbo_ppl.inference.slam.orientation import orientation_log_density, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import mixture_log_density, observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.state_types import SlamState
 from nolbo_ppl.inference.slam.tracklets import Tracklets, build_tracklets
 
@@ -54,16 +54,17 @@ def first_estimate(
     T = make_pose(np.tile(np.eye(3), (landmarks, 1, 1)), mean / np.maximum(total, 1e-300)[:, None])
     symmetry = resolved_symmetry(table, config)[rows]
     oriented = np.flatnonzero(table.has_rotation[rows])
-    R = problem.odometry[frame[oriented], :3, :3] @ table.rotation[rows[oriented]]
+    modes = observed_modes(table, np.maximum(noise.rotation_scale, 0.05), rows[oriented])
+    modes = modes.turned(problem.odometry[frame[oriented], :3, :3])
     order = np.argsort(landmark[oriented], kind="stable")
     groups, starts = np.unique(landmark[oriented][order], return_index=True)
     for j, members in zip(groups, np.split(order, starts[1:])):
-        # The detection most of the others agree with, modes included: a mean would fall between flips.
+        # The mode most detections agree with: a mean would fall between flips.
         members = members[np.linspace(0, len(members) - 1, min(len(members), 12)).astype(int)]
-        a, b = np.repeat(members, len(members)), np.tile(members, len(members))
-        value = orientation_log_density(R[a], R[b], np.maximum(noise.rotation_scale[rows[oriented[b]]], 0.05),
-                                        symmetry[oriented[b]], config)
-        T[j, :3, :3] = R[members[np.argmax(value.reshape(len(members), -1).sum(axis=1))]]
+        candidates = modes.R[members][np.isfinite(modes.log_weight[members])]
+        a, b = np.repeat(np.arange(len(candidates)), len(members)), np.tile(members, len(candidates))
+        value = mixture_log_density(candidates[a], modes.select(b), symmetry[oriented[b]], config)
+        T[j, :3, :3] = candidates[np.argmax(value.reshape(len(candidates), -1).sum(axis=1))]
     return Estimate(problem.odometry.copy(), T)
 
 
@@ -138,7 +139,7 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
     prior = fit_prior(problem.observations, config)
     tracklets = build_tracklets(problem, noise, config, prior)
     state = init_from_tracklets(problem, config, noise, prior, tracklets)
-    if all(stated_scales(config)) or not len(tracklets):
+    if all(stated_scales(problem, config)) or not len(tracklets):
         return state
     # Tracks were broken where the default scales were much too small: track once more with the better ones.
     growth = (

@@ -17,7 +17,13 @@ from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fuse_latent
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, orientation_log_density, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import (
+    UNIFORM_LOG_DENSITY,
+    RotationModes,
+    mixture_log_density,
+    observed_modes,
+    resolved_symmetry,
+)
 
 GATE = 30.0
 """Squared Mahalanobis distance beyond which a detection cannot belong to a track (3 degrees of freedom: p = 1e-6)."""
@@ -56,8 +62,8 @@ class Tracker:
         self.mean = np.zeros((0, 3))
         self.covariance = np.zeros((0, 3, 3))
         self.last = np.zeros(0, dtype=np.int64)
-        self.R_world_object = np.zeros((0, 3, 3))
-        self.rotation_scale = np.zeros(0)
+        self.modes = RotationModes(np.zeros((0, 1)), np.zeros((0, 1, 3, 3)), np.zeros((0, 1)))
+        self.oriented = np.zeros(0, dtype=bool)
         self.latent = np.zeros((0, dimension))
         self.latent_variance = np.zeros((0, dimension))
         self.category = np.zeros(0, dtype=np.int64)
@@ -75,16 +81,16 @@ class Tracker:
         self.covariance += variance[:, None, None] * np.eye(3)
 
     def _keep(self, rows: np.ndarray) -> None:
-        for name in ("index", "mean", "covariance", "last", "R_world_object", "rotation_scale", "latent",
-                     "latent_variance", "category"):
+        for name in ("index", "mean", "covariance", "last", "oriented", "latent", "latent_variance", "category"):
             setattr(self, name, getattr(self, name)[rows])
+        self.modes = self.modes.select(rows)
 
     def associate(
         self,
         position: Float[np.ndarray, "n 3"],
         covariance: Float[np.ndarray, "n 3 3"],
-        R_world_object: Float[np.ndarray, "n 3 3"],
-        rotation_scale: Float[np.ndarray, " n"],
+        modes: RotationModes,
+        oriented: Bool[np.ndarray, " n"],
         symmetry: Int[np.ndarray, " n"],
         latent: Float[np.ndarray, "n d"],
         latent_variance: Float[np.ndarray, "n d"],
@@ -93,6 +99,8 @@ class Tracker:
         frame: int,
     ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1: background."""
+        count = max(modes.log_weight.shape[1], self.modes.log_weight.shape[1])
+        modes, self.modes = modes.padded(count), self.modes.padded(count)
         n, m = len(position), len(self.index)
         log_likelihood = np.full((n, m), -np.inf)
         log_object, log_background = np.log(objectness), np.log1p(-objectness) + np.log(self.clutter_rate)
@@ -107,12 +115,9 @@ class Tracker:
             inside = square < GATE
             k, j = k[inside], j[inside]
             value = log_object[k] - 0.5 * (square + log_det)[inside]
-            oriented = np.isfinite(rotation_scale[k]) & np.isfinite(self.rotation_scale[j])
-            if oriented.any():
-                a, b = k[oriented], j[oriented]
-                scale = np.sqrt(rotation_scale[a] ** 2 + self.rotation_scale[b] ** 2)
-                value[oriented] += orientation_log_density(
-                    self.R_world_object[b], R_world_object[a], scale, symmetry[a], self.config) - UNIFORM_LOG_DENSITY
+            both = np.flatnonzero(oriented[k] & self.oriented[j])
+            if len(both):
+                value[both] += self._orientation(j[both], modes.select(k[both]), symmetry[k[both]])
             value += self.prior.pair_log_ratio(latent[k], latent_variance[k], category[k], self.latent[j],
                                                self.latent_variance[j], self.category[j])
             log_likelihood[k, j] = value
@@ -127,8 +132,9 @@ class Tracker:
         for i in range(n):
             if m and weights[i, best[i]] > 0.5:
                 track = int(best[i])
-                self._update(track, position[i], covariance[i], latent[i], latent_variance[i], R_world_object[i],
-                             rotation_scale[i], frame)
+                self._update(track, position[i], covariance[i], latent[i], latent_variance[i], frame)
+                if oriented[i]:
+                    self._orient(track, modes.select(np.array([i])), symmetry[[i]])
                 assigned[i], weight[i] = self.index[track], weights[i, track]
             elif null[i] > 0.5 and objectness[i] > 0.05:
                 found.append(i)
@@ -141,16 +147,16 @@ class Tracker:
             self.mean = np.concatenate([self.mean, position[rows]])
             self.covariance = np.concatenate([self.covariance, covariance[rows]])
             self.last = np.concatenate([self.last, np.full(len(rows), frame)])
-            self.R_world_object = np.concatenate([self.R_world_object, R_world_object[rows]])
-            self.rotation_scale = np.concatenate([self.rotation_scale, rotation_scale[rows]])
+            self.oriented = np.concatenate([self.oriented, oriented[rows]])
+            self.modes = RotationModes(*(np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]])
+                                         for name in ("log_weight", "R", "scale")))
             self.latent = np.concatenate([self.latent, latent[rows]])
             self.latent_variance = np.concatenate([self.latent_variance, latent_variance[rows]])
             self.category = np.concatenate([self.category, category[rows]])
         return assigned, weight
 
     def _update(
-        self, j: int, position: np.ndarray, covariance: np.ndarray, latent: np.ndarray, latent_variance: np.ndarray,
-        R_world_object: np.ndarray, rotation_scale: float, frame: int,
+        self, j: int, position: np.ndarray, covariance: np.ndarray, latent: np.ndarray, latent_variance: np.ndarray, frame: int
     ) -> None:
         gain = np.linalg.solve(self.covariance[j] + covariance, self.covariance[j]).T
         self.mean[j] += gain @ (position - self.mean[j])
@@ -159,10 +165,29 @@ class Tracker:
         self.latent[j], self.latent_variance[j] = fuse_latent(
             self.latent[j], self.latent_variance[j], latent, latent_variance
         )
-        # The last orientation stands for the track: averaging over possible flips would need its modes.
-        if np.isfinite(rotation_scale) and not np.isfinite(self.rotation_scale[j]):
-            self.R_world_object[j], self.rotation_scale[j] = R_world_object, rotation_scale
         self.last[j] = frame
+
+    def _by_mode(self, tracks: np.ndarray, modes: RotationModes, symmetry: np.ndarray) -> np.ndarray:
+        """Log density [n, K] of observed orientations given each mode of a track's, both widths added."""
+        n, count = modes.log_weight.shape
+        own = self.modes.select(tracks)
+        seen = modes.select(np.repeat(np.arange(n), count))
+        wide = RotationModes(seen.log_weight, seen.R, np.hypot(seen.scale, own.scale.reshape(-1, 1)))
+        return mixture_log_density(own.R.reshape(-1, 3, 3), wide, np.repeat(symmetry, count), self.config).reshape(n, count)
+
+    def _orientation(self, tracks: np.ndarray, modes: RotationModes, symmetry: np.ndarray) -> np.ndarray:
+        """Log ratio of observed orientations given tracks to any orientation."""
+        joint = self.modes.log_weight[tracks] + self._by_mode(tracks, modes, symmetry)
+        return np.logaddexp.reduce(joint, axis=1) - UNIFORM_LOG_DENSITY
+
+    def _orient(self, j: int, modes: RotationModes, symmetry: np.ndarray) -> None:
+        """The first orientation founds the track's modes, later ones weigh them."""
+        if not self.oriented[j]:
+            self.oriented[j] = True
+            self.modes.log_weight[j], self.modes.R[j], self.modes.scale[j] = modes.log_weight[0], modes.R[0], modes.scale[0]
+        elif self.modes.log_weight.shape[1] > 1:
+            joint = self.modes.log_weight[j] + self._by_mode(np.array([j]), modes, symmetry)[0]
+            self.modes.log_weight[j] = joint - np.logaddexp.reduce(joint)
 
 
 def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior) -> Tracklets:
@@ -174,8 +199,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
         R = problem.odometry[table.frame, :3, :3]
         world = transform(problem.odometry[table.frame], table.position)
         covariance = R @ noise.position_covariance @ np.swapaxes(R, 1, 2)
-        R_world_object = np.where(table.has_rotation[:, None, None], R @ np.nan_to_num(table.rotation), np.eye(3))
-        rotation_scale = np.where(table.has_rotation, noise.rotation_scale, np.nan)
+        modes, oriented = observed_modes(table, noise.rotation_scale).turned(R), table.has_rotation
         latent, latent_variance, category = detection_features(table, noise, prior)
         symmetry = resolved_symmetry(table, config)
         objectness = np.clip(table.objectness, *config.objectness_limits)
@@ -190,7 +214,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
             if rows is None:
                 continue
             assigned[rows], weight[rows] = tracker.associate(
-                world[rows], covariance[rows], R_world_object[rows], rotation_scale[rows], symmetry[rows], latent[rows],
+                world[rows], covariance[rows], modes.select(rows), oriented[rows], symmetry[rows], latent[rows],
                 latent_variance[rows], category[rows], objectness[rows], t)
     return summarise_tracks(problem, noise, config, assigned, weight)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import gtsam
@@ -10,7 +11,7 @@ import pytest
 
 from nolbo_ppl.data.observations import make_table
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
-from nolbo_ppl.geometry.pose import make_pose, relative, se3_exp, se3_log
+from nolbo_ppl.geometry.pose import make_pose, relative, se3_exp, se3_log, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, plain_init, plain_solve
 from nolbo_ppl.inference.slam.plain import PlainState, e_step, mode_log_likelihood
 
@@ -33,6 +34,23 @@ def test_the_bound_never_falls(seed: int, latent_dim: int, rotation: float | Non
     _, infos = plain_solve(small(seed, latent_dim, rotation), iterations=8, tolerance=-np.inf)
     bounds = np.array([info.bound for info in infos])
     assert len(bounds) == 8
+    assert bounds[-1] > bounds[0] + 0.5
+    assert np.diff(bounds).min() > -1e-6 * np.abs(bounds).max()
+
+
+def test_the_bound_never_falls_with_stated_modes() -> None:
+    state = small(4)
+    table = state.problem.observations
+    rng = np.random.default_rng(0)
+    wrong = table.rotation @ so3_exp(np.pi / 2 * np.array([0, 0, 1.0]))
+    first = rng.random(len(table)) < 0.7
+    modes = np.where(first[:, None, None, None], np.stack([table.rotation, wrong], 1), np.stack([wrong, table.rotation], 1))
+    table = replace(table, rotation=modes[:, 0], mode_weight=np.tile([0.6, 0.4], (len(table), 1)), mode_rotation=modes,
+                    mode_std=np.full((len(table), 2), 0.05))
+    problem = SlamProblem(state.problem.odometry, table)
+    start = plain_init(problem, CONFIG, state.estimate.T_world_landmark, noise=state.noise)
+    _, infos = plain_solve(start, iterations=8, tolerance=-np.inf)
+    bounds = np.array([info.bound for info in infos])
     assert bounds[-1] > bounds[0] + 0.5
     assert np.diff(bounds).min() > -1e-6 * np.abs(bounds).max()
 
