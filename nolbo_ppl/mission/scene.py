@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 LEAST_EXISTENCE = 0.5
 """Landmarks that are more likely background are left out."""
+PATH_COLOUR = "#2f6fde"
+"""The camera's path."""
 T_GLTF_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 """glTF has y up; the world of a run has x right, y down, z forward."""
 
@@ -84,8 +86,10 @@ def build_scene(
     path = T_world_camera[:, :3, 3]
     if len(path) > 1:
         way = trimesh.load_path(path)
-        way.colors = np.tile(_colour("#2f6fde"), (len(way.entities), 1))
-        scene.add_geometry(way, node_name="trajectory", geom_name="trajectory", parent_node_name="run")
+        way.colors = np.tile(_colour(PATH_COLOUR), (len(way.entities), 1))
+    else:
+        way = trimesh.PointCloud(path, colors=_colour(PATH_COLOUR))
+    scene.add_geometry(way, node_name="trajectory", geom_name="trajectory", parent_node_name="run")
     return scene
 
 

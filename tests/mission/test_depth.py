@@ -33,7 +33,7 @@ def test_the_fused_position_is_the_product_of_both_gaussians() -> None:
     covariance = R @ np.diag([0.02, 0.05, 0.2]) @ R.T
     measured, scale = 2.3, 0.15
     mean, fused = fuse_along_ray(position[None], covariance[None], np.array([measured]), np.array([scale]))
-    side = np.linspace(-2.5, 2.5, 161)
+    side = np.linspace(-2.5, 2.5, 81)
     grid = position + np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     ray = position / np.linalg.norm(position)
     difference = grid - position

@@ -1,0 +1,80 @@
+"""The truth of a drive: read, refused where it does not fit, and whose each detection is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.mission.truth import DriveTruth, TrueFrame, match_detections, read_truth
+from tests.mission.conftest import SimulatedDrive
+
+
+def names(drive: SimulatedDrive) -> list[str]:
+    return [f"../anywhere/images/{t:06d}.png" for t in range(len(drive.truth))]
+
+
+def test_truth_of_a_drive(drive: SimulatedDrive) -> None:
+    truth = read_truth(drive.folder, names(drive)[5:40:5])
+    assert len(truth) == len(drive.model.latents) and len(truth.frames) == 7
+    seen = truth.frames[2]  # the frames that were asked for, in that order
+    T = drive.truth[15]
+    world = np.einsum("ij,nj->ni", T[:3, :3], seen.position) + T[:3, 3]
+    np.testing.assert_allclose(world, truth.T_world_object[seen.object, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(T[:3, :3] @ seen.R_camera_object, truth.T_world_object[seen.object, :3, :3], atol=1e-9)
+
+
+def test_every_simulated_detection_finds_its_object(drive: SimulatedDrive) -> None:
+    """Boxes follow from noisy positions: what matches is right, and with exact boxes everything matches."""
+    truth, table = read_truth(drive.folder, names(drive)), drive.model.table
+    seen = np.concatenate([frame.object for frame in truth.frames])
+    frame = np.repeat(np.arange(len(truth.frames)), [len(one.object) for one in truth.frames])
+    exact = match_detections(frame, np.concatenate([one.box for one in truth.frames]), np.ones(len(frame)), truth)
+    np.testing.assert_array_equal(exact.object, seen)
+    assert exact.recall == 1.0 and exact.precision == 1.0
+    from tests.mission.conftest import boxes_of
+
+    found = match_detections(table.frame, boxes_of(table.position), table.objectness, truth)
+    matched = found.object >= 0
+    assert matched.mean() > 0.8
+    assert (found.object[matched] == drive.object_of[matched]).mean() > 0.98
+
+
+def one_frame(box: list[list[float]], visibility: list[float]) -> DriveTruth:
+    n = len(box)
+    frame = TrueFrame(np.arange(n), np.array(box), np.tile([0, 0, 5.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1)),
+                      np.array(visibility))  # fmt: skip
+    text = tuple("x" * n)
+    return DriveTruth(text, text, text, np.tile(np.eye(4), (n, 1, 1)), np.ones(n), np.ones(n, dtype=int), np.zeros(n, dtype=bool),
+                      {}, (frame,))  # fmt: skip
+
+
+def test_hardly_seen_objects_count_neither_way() -> None:
+    truth = one_frame([[0, 0, 20, 20], [50, 0, 70, 20], [80, 0, 90, 10]], [1.0, 0.2, 1.0])  # large, hidden, small
+    box = np.array([[0.0, 0, 20, 20], [50, 0, 70, 20], [80, 0, 90, 10], [120, 0, 140, 20], [1, 0, 21, 20]])
+    found = match_detections(np.zeros(5, dtype=int), box, np.array([0.9, 0.8, 0.7, 0.6, 0.5]), truth)
+    np.testing.assert_array_equal(found.object, [0, 1, 2, -1, -1])  # the second box of the first object is of none
+    np.testing.assert_array_equal(found.counted, [True, False, False, False, False])
+    assert (found.found, found.wanted) == (1, 1)
+    assert found.precision == pytest.approx(1 / 3) and found.recall == 1.0
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "match"),
+    [
+        ("objects.json", "[]", r"scenes.jsonl:\d+: an object that objects.json does not know"),
+        ("objects.json", '[{"id": "O0"}]', "not the objects of a drive"),
+        ("scenes.jsonl", "", "truth lacks an image"),
+        ("scenes.jsonl", json.dumps({"image": "images/000000.png", "objects": [{"id": "O0"}]}) + "\n", ":1: not a line of a drive"),
+    ],
+)
+def test_bad_truth_is_refused(drive: SimulatedDrive, tmp_path: Path, file: str, change: str, match: str) -> None:
+    for name in ("objects.json", "scenes.jsonl", "voxels.npz"):
+        shutil.copy(drive.folder / name, tmp_path / name)
+    (tmp_path / file).write_text(change)
+    with pytest.raises(InputError, match=match):
+        read_truth(tmp_path, names(drive))
