@@ -257,9 +257,9 @@ def observe_ratio(batch: SceneBatch, settings: Settings, decode: bool, half_prec
     @torch.inference_mode()
     def bare() -> None:
         encoding = model.model.guide.encode(stacked)
-        region = torch.arange(found)
-        features = encoding.features.flatten(0, 1)[region % encoding.features.shape[:2].numel()]
-        q = model.model.guide.parameters_at(features, region % model.config.predictors)
+        index = torch.arange(found)
+        count, cells = encoding.features.shape[:2]
+        q = model.model.guide.parameters_at(encoding, index % count, index % (cells * model.config.predictors))
         if decode:
             noise = torch.randn(samples, *q.shape_loc.shape)
             latents = torch.cat((q.shape_loc[None], q.shape_loc + q.shape_scale * noise)).flatten(0, 1)

@@ -10,13 +10,18 @@ from nolbo_ppl import __version__
 from nolbo_ppl.errors import NolboError
 
 VERBS = {
-    "demo": "a short training run, then posteriors of unseen scenes",
+    "demo": "a small drive, from its images to a map with a report",
     "scenes": "write a data set of generated scenes",
     "train": "train an observation model",
     "evaluate": "measure a model on unseen scenes",
     "observe": "posteriors of the objects in a folder of images",
     "convert": "bring real data into the formats of slam",
     "slam": "correct a trajectory and map objects, from odometry and observations",
+    "drive": "write a drive through a generated world: images, poses, objects",
+    "odometry": "visual odometry of an image sequence",
+    "run": "from the images of a drive to a corrected trajectory and a map of objects",
+    "report": "one self-contained page about a run",
+    "view": "a run in 3D, in the browser",
 }
 """Name of each verb (its module in the package) and what it does."""
 

@@ -54,7 +54,7 @@ class DemoConfig:
     """Scenes of the short run."""
     scenes: int = 24
     """Unseen scenes to observe; the one with the most objects is drawn."""
-    threshold: float = 0.5
+    threshold: float = 0.3
     """Least objectness of a detection."""
     seed: int = 0
     """Seed of the short run."""

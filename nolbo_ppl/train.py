@@ -31,7 +31,7 @@ from nolbo_ppl.inference.journal import Journal
 from nolbo_ppl.inference.monitor import held_out
 from nolbo_ppl.inference.stages import StageRun
 from nolbo_ppl.inference.train_config import TrainConfig as TrainConfig
-from nolbo_ppl.inference.weights import save
+from nolbo_ppl.inference.weights import load, save
 from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.nolbo import Nolbo
 from nolbo_ppl.models.scene import SceneBatch
@@ -65,6 +65,8 @@ def run(config: TrainConfig) -> TrainSummary:
         torch.set_num_threads(config.threads)
     data = TrainingData(config, rank, world)
     model = Nolbo.from_seed(data.model, config.seed)
+    if config.initial is not None:
+        model.load_state_dict(load(config.initial).model.state_dict())
     journal = Journal(config, rank)
     stages = config.stages()
     first, tensors, at_step = journal.resume(model, stages)

@@ -31,6 +31,8 @@ def tiny_config(**changes: Any) -> ModelConfig:
         "encoder_channels": (4, 6, 8, 12),
         "encoder_blocks": (0, 1, 1),
         "head_width": 16,
+        "glimpse": 4,
+        "glimpse_width": 4,
         "image_size": 64,
         "latent_dim": 4,
         "prior_width": 8,
@@ -54,7 +56,10 @@ def tiny_model(config: ModelConfig | None = None, seed: int = 0, scatter: float 
     if scatter:
         generator = torch.Generator().manual_seed(seed + 1)
         with torch.no_grad():
-            for parameter in (model.guide.head.outputs[-1].weight, model.guide.head.objectness.weight):
+            last = [model.guide.head.outputs[-1].weight, model.guide.head.objectness.weight]
+            if model.guide.head.glimpse is not None:
+                last.append(model.guide.head.glimpse.judge[-1].weight)
+            for parameter in last:
                 parameter.add_(scatter * torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype))
     return model
 

@@ -18,6 +18,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from nolbo_ppl.data import cache, training
 from nolbo_ppl.data.dataset import write_scenes
 from nolbo_ppl.data.scene_config import preset
 from nolbo_ppl.data.source import SceneSource
@@ -114,6 +115,36 @@ def test_the_model_can_be_loaded_and_tells_how_it_came_about(uninterrupted: Path
     history = rows(uninterrupted)
     shapes = [row["loss"] for row in history if row["stage"] == "shapes"]
     assert shapes == sorted(shapes, reverse=True)
+
+
+def test_a_run_can_start_from_trained_weights(
+    folders: tuple[Path, Path], uninterrupted: Path, tmp_path: Path
+) -> None:
+    """Without steps the weights are those given; shapes stay as they are; another form of the networks is refused."""
+    start = str(uninterrupted / "model")
+    config = config_of(folders, tmp_path / "same", initial=start, shape_steps=0, single_steps=0, scene_steps=0)
+    run(config)
+    assert_same(weights(tmp_path / "same"), weights(uninterrupted))
+    run(config_of(folders, tmp_path / "more", initial=start, shape_steps=0, single_steps=0, scene_steps=2))
+    before, after = weights(uninterrupted), weights(tmp_path / "more")
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed and all(name.startswith("guide.") for name in changed)
+    with pytest.raises(InputError, match="initial weights of another form"):
+        config_of(folders, tmp_path / "other", initial=start, latent_dim=8).model()
+
+
+def test_mixed_difficulties_are_half_and_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first half of the generated scenes is `standard`, the second `full`; held-out scenes as well."""
+    monkeypatch.setattr(cache, "BLOCK", 4)
+    config = TrainConfig(tmp_path / "run", preset="nano", difficulty="mixed", count=8, evaluate_scenes=4, cache=tmp_path,
+                         single_steps=0, workers=1)
+    monkeypatch.setattr(training, "LEAST_HELD_OUT", 4)
+    data = training.TrainingData(config, 0, 1)
+    assert len(data.train) == 8
+    sources = {read_json(path)["config"]["objects"][1] for path in (tmp_path / "scenes").glob("*/source.json")}
+    assert sources == {preset("standard").objects[1], preset("full").objects[1]}
+    first = data.train.batch(np.arange(4))["image"]
+    np.testing.assert_array_equal(first[0], SceneSource(preset("standard", 64), 0).render(0).image.transpose(2, 0, 1))
 
 
 def test_metrics_have_a_row_a_step_whose_terms_make_the_loss(uninterrupted: Path) -> None:

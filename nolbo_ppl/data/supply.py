@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nolbo_ppl.data.arrays import Arrays
 from nolbo_ppl.data.augment import Augmentation, augment
+from nolbo_ppl.data.cache import CachedScenes
 from nolbo_ppl.data.loader import Scenes, batch_indices
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.stages import seeded_noise
@@ -36,6 +37,38 @@ class Part:
     def batch(self, indices: Int[np.ndarray, " b"]) -> Arrays:
         """The scenes of these numbers."""
         return self.scenes.batch(self.index[np.asarray(indices)])
+
+
+class Joined:
+    """Several data sets of one pool of shapes, one after the other."""
+
+    def __init__(self, parts: Sequence[CachedScenes]) -> None:
+        self.parts = parts
+        self._first = np.cumsum([0, *(len(part) for part in parts)])
+
+    def __len__(self) -> int:
+        return int(self._first[-1])
+
+    def batch(self, indices: Int[np.ndarray, " b"]) -> Arrays:
+        """The scenes of these numbers."""
+        index = np.asarray(indices)
+        owner = np.searchsorted(self._first, index, side="right") - 1
+        result: Arrays = {}
+        for number, part in enumerate(self.parts):
+            rows = np.flatnonzero(owner == number)
+            if not len(rows):
+                continue
+            for name, value in part.batch(index[rows] - self._first[number]).items():
+                if name not in result:
+                    result[name] = np.empty((len(index), *value.shape[1:]), value.dtype)
+                result[name][rows] = value
+        return result
+
+    def shapes(self) -> tuple[Int[np.ndarray, " n"], UInt8[np.ndarray, "n bytes"], Int[np.ndarray, " n"]]:
+        """Number, voxels and category of every shape, each once."""
+        number, packed, category = (np.concatenate(values) for values in zip(*(part.shapes() for part in self.parts)))
+        number, first = np.unique(number, return_index=True)
+        return number, packed[first], category[first]
 
 
 class ShapeTable:

@@ -17,7 +17,7 @@ from nolbo_ppl.data.loader import Scenes, prefetch
 from nolbo_ppl.data.scene_config import SceneConfig
 from nolbo_ppl.data.scene_config import preset as scene_preset
 from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.data.supply import Part, SceneSupply, ShapeTable
+from nolbo_ppl.data.supply import Joined, Part, SceneSupply, ShapeTable
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.stages import seeded_noise
 from nolbo_ppl.inference.train_config import TrainConfig
@@ -26,6 +26,9 @@ from nolbo_ppl.models.scene import SceneBatch
 
 VALIDATION_SEED = 1000
 """Added to the seed of generated scenes for the held-out ones: other scenes, other shapes."""
+
+LEAST_HELD_OUT = 512
+"""Least number of generated held-out scenes."""
 
 
 class TrainingData:
@@ -41,18 +44,23 @@ class TrainingData:
         if config.scenes is not None:
             self._open_folders(config.scenes, size)
         else:
-            base = scene_preset(config.difficulty, size)
-            backgrounds = None if config.backgrounds is None else str(config.backgrounds)
+            kinds = ("standard", "full") if config.difficulty == "mixed" else (config.difficulty,)
+            bases = [scene_preset(kind, size) for kind in kinds]
+            photographs = None if config.backgrounds is None else str(config.backgrounds)
             root = config.cache.expanduser() / "scenes"
             if world > 1 and rank > 0:
                 distributed.barrier()  # the first process renders what is missing
-            single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
+            single = dataclasses.replace(bases[0], objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
 
             def cached(of: SceneConfig, seed: int, count: int) -> CachedScenes:
-                return write_cache(root, SceneSource(of, seed, backgrounds=backgrounds), count, config.workers)
+                behind = None if of is bases[0] and len(bases) > 1 else photographs
+                return write_cache(root, SceneSource(of, seed, backgrounds=behind), count, config.workers)
 
-            train = cached(base, config.seed, config.count)
-            held_out_scenes = cached(base, config.seed + VALIDATION_SEED, max(512, config.evaluate_scenes))
+            def all_of(seed: int, count: int) -> Joined:
+                return Joined([cached(base, seed, -(-count // len(bases))) for base in bases])
+
+            train = all_of(config.seed, config.count)
+            held_out_scenes = all_of(config.seed + VALIDATION_SEED, max(LEAST_HELD_OUT, config.evaluate_scenes))
             self.train, self._held_out = train, held_out_scenes
             self.single = self.train
             if config.single_steps:

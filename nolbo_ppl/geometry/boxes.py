@@ -38,6 +38,16 @@ def nms(
     A box goes when it overlaps a kept box of a higher score, and of its own group where groups (images) are given, by
     more than `iou_threshold`.
     """
+    return suppress(boxes, scores, iou_threshold, group)[0]
+
+
+def suppress(
+    boxes: Float[Tensor, "n 4"],
+    scores: Float[Tensor, " n"],
+    iou_threshold: float = 0.5,
+    group: Int[Tensor, " n"] | None = None,
+) -> tuple[Int[Tensor, " kept"], Int[Tensor, " n"]]:
+    """What `nms` keeps, and for each box the kept one that stands for it (itself, or the one that removed it)."""
     order = torch.argsort(scores, descending=True, stable=True)
     iou = pairwise_iou(boxes[order], boxes[order])
     if group is not None:
@@ -45,8 +55,13 @@ def nms(
     overlaps = ~(iou <= iou_threshold).numpy()
     removed = np.zeros(len(order), dtype=np.bool_)
     kept: list[int] = []
+    owner = np.arange(len(order))
     for i in range(len(order)):
         if not removed[i]:
             kept.append(i)
+            owner[overlaps[i] & ~removed] = i
+            owner[i] = i
             removed |= overlaps[i]
-    return order[torch.tensor(kept, dtype=torch.long)]
+    stands_for = torch.empty_like(order)
+    stands_for[order] = order[torch.from_numpy(owner)]
+    return order[torch.tensor(kept, dtype=torch.long)], stands_for

@@ -55,8 +55,16 @@ INCLUSIVE_PARTS = ("azimuth_inclusive", "tilt_inclusive")
 """Parts of inclusive terms, with weights of their own: the azimuth, and elevation with in-plane rotation, of
 `orientation_inclusive`."""
 
+SHAPE_LABEL = "shape_label"
+"""Expected log probability of the label given the shape latent, under the mixture prior (`shape_vae`): no part of the
+bound. It keeps the categories of the prior apart, so that maximum likelihood over the prior means can tell them."""
+
 BOUND_TERMS = (*KL_TERMS.values(), *LIKELIHOOD_TERMS)
 """Every term of the pure bound."""
+
+SHAPE_STAGE: dict[str, float] = {"shape_kl": 2.0, "voxels": 1.0, "instance_kl": 2.0, SHAPE_LABEL: 20.0}
+"""Weights of the shape autoencoder's stage. Voxels are thousands of nats, so that at weight one the latents of a category
+scatter more than its unit prior and the means of categories lie close beside them."""
 
 PURE_BOUND: dict[str, float] = dict.fromkeys(BOUND_TERMS, 1.0)
 """Weights of the pure bound: its negative sum is the loss that `objective="elbo"` minimises."""
@@ -102,7 +110,7 @@ class SceneElbo:
     """
 
     def __init__(self, weights: Mapping[str, float] = PURE_BOUND) -> None:
-        known = {*BOUND_TERMS, *INCLUSIVE_TERMS.values(), *INCLUSIVE_PARTS}
+        known = {*BOUND_TERMS, *INCLUSIVE_TERMS.values(), *INCLUSIVE_PARTS, SHAPE_LABEL}
         unknown = sorted(set(weights) - known)
         if unknown:
             raise input_error("unknown term of the bound", got=unknown, expected=f"names among {sorted(known)}")
@@ -147,9 +155,9 @@ class SceneElbo:
         enumerated = _enumerated(guide_trace)
         terms: dict[str, Tensor] = {}
         for name, site in model_trace.nodes.items():
-            if site["type"] != "sample" or name not in (*KL_TERMS, *LIKELIHOOD_TERMS):
+            if site["type"] != "sample" or name not in (*KL_TERMS, *LIKELIHOOD_TERMS, SHAPE_LABEL):
                 continue
-            if name in LIKELIHOOD_TERMS:
+            if name in LIKELIHOOD_TERMS or name == SHAPE_LABEL:
                 if name in wanted:
                     terms[name] = _reduce(_log_likelihood(site, guide_trace), site, site["mask"], enumerated)
                 continue

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.boxes import box_iou, nms
+from nolbo_ppl.geometry.boxes import box_iou, suppress
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.inference.observations import Observations, ViewpointModes
 from nolbo_ppl.models.calibration import Calibration
@@ -41,6 +41,9 @@ class _Prepared:
     image: UInt8[Tensor, "3 h w"]
     camera: Float[Tensor, " 4"]
     scale: Float[np.ndarray, " 2"]
+
+CANDIDATE = 0.02
+"""Regions of at least this objectness count towards the object they describe."""
 
 
 class ObservationModel:
@@ -86,6 +89,7 @@ class ObservationModel:
         *,
         threshold: float = 0.3,
         iou_threshold: float = 0.45,
+        size: int | None = None,
         decode: bool = True,
         samples: int = 8,
         seed: int = 0,
@@ -98,7 +102,10 @@ class ObservationModel:
             intrinsics: [fx, fy, cx, cy] in px of the given image, one for all or one an image. Without them the camera
                 is taken to see 60 degrees across, and positions are as good as that guess.
             threshold: least objectness of a detection.
-            iou_threshold: overlap above which the less certain of two detections is dropped.
+            iou_threshold: overlap above which the less certain of two regions is taken to describe the same object. Only
+                one region is responsible for an object, so that the probabilities of all that describe it add up.
+            size: longer side, px, that images are scaled to, a multiple of 32; the network's own by default. It is fully
+                convolutional: a larger side suits wide images with objects that would else be too small.
             decode: decode shapes (voxels, sizes, meshes); without it sizes are the category's mean proportions.
             samples: samples of the shape latent behind the voxel mean and variance.
             seed: seed of those samples.
@@ -112,11 +119,11 @@ class ObservationModel:
         """
         single = (isinstance(images, np.ndarray) and images.ndim == 3) or (isinstance(images, Tensor) and images.dim() == 3)
         sequence: list[Any] = [images] if single else list(images)  # type: ignore[list-item]
-        prepared = self._prepare_all(sequence, intrinsics)
+        prepared = self._prepare_all(sequence, intrinsics, size)
         if not 0 < threshold < 1:
             raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
 
-        def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor]:
+        def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor, Tensor]:
             return self._detections(encoding, logit, threshold, iou_threshold)
 
         results = self._observe(prepared, detect, decode, samples, seed, batch)
@@ -128,6 +135,7 @@ class ObservationModel:
         intrinsics: Any,
         boxes: Sequence[Float[np.ndarray, "n 4"]],
         *,
+        size: int | None = None,
         decode: bool = True,
         samples: int = 8,
         seed: int = 0,
@@ -139,12 +147,13 @@ class ObservationModel:
         """
         if len(boxes) != len(images):
             raise input_error("boxes", got=f"{len(boxes)} lists", expected=f"one list for each of {len(images)} images")
-        prepared = self._prepare_all(images, intrinsics)
+        prepared = self._prepare_all(images, intrinsics, size)
 
-        def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor]:
+        def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor, Tensor]:
             scaled = [np.asarray(boxes[i], dtype=np.float64).reshape(-1, 4) * np.tile(prepared[i].scale, 2) for i in group]
             row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
-            return row, self._responsible(encoding, row, torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype))
+            region = self._responsible(encoding, row, torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype))
+            return row, region, logit[row, region]
 
         return self._observe(prepared, responsible, decode, samples, seed, batch)
 
@@ -157,31 +166,34 @@ class ObservationModel:
     def _observe(
         self,
         prepared: list[_Prepared],
-        find: Callable[[Encoding, Tensor, list[int]], tuple[Tensor, Tensor]],
+        find: Callable[[Encoding, Tensor, list[int]], tuple[Tensor, Tensor, Tensor]],
         decode: bool,
         samples: int,
         seed: int,
         batch: int,
     ) -> list[Observations]:
-        """Run batches of images of one shape; `find` gives (row, region) of what to answer for."""
+        """Run batches of images of one shape; `find` gives row, region and log odds of what to answer for."""
         results: dict[int, Observations] = {}
         for group in _same_shape(prepared, batch):
             encoding = self.encode(torch.stack([prepared[i].image for i in group]))
             logit = self.calibration.objectness(encoding.objectness_logit)
-            row, region = find(encoding, logit, group)
+            row, region, odds = find(encoding, logit, group)
             camera = torch.stack([prepared[i].camera for i in group])[row]
             scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
-            answer = self._answer(encoding, row, region, camera, scale, logit[row, region], decode, samples, seed)
+            answer = self._answer(encoding, row, region, camera, scale, odds, decode, samples, seed)
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
             for k, i in enumerate(group):
                 results[i] = answer[slice(ends[k], ends[k + 1])]
         return [results[i] for i in range(len(prepared))]
 
-    def _prepare_all(self, images: Sequence[Any], intrinsics: Any) -> list[_Prepared]:
-        return [self._prepare(image, _one_of(intrinsics, i, len(images))) for i, image in enumerate(images)]
+    def _prepare_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[_Prepared]:
+        size = self.config.image_size if size is None else size
+        if size <= 0 or size % 32:
+            raise input_error("size of the scaled images", got=size, expected="a positive multiple of 32")
+        return [self._prepare(image, _one_of(intrinsics, i, len(images)), size) for i, image in enumerate(images)]
 
-    def _prepare(self, image: Any, intrinsics: Any) -> _Prepared:
-        """Scale an image so that its longer side has the network's size and both are multiples of 32."""
+    def _prepare(self, image: Any, intrinsics: Any, size: int) -> _Prepared:
+        """Scale an image so that its longer side has the wanted size and both are multiples of 32."""
         if isinstance(image, Tensor):
             image = image.permute(1, 2, 0).numpy() if image.dim() == 3 else image.numpy()
         if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -196,7 +208,7 @@ class ObservationModel:
             camera = np.asarray(intrinsics, dtype=np.float64)
             if camera.shape != (4,) or not np.isfinite(camera).all() or (camera[:2] <= 0).any():
                 raise input_error("intrinsics", got=intrinsics, expected="[fx, fy, cx, cy] in px with positive fx, fy")
-        factor = self.config.image_size / max(height, width)
+        factor = size / max(height, width)
         new = [max(32, round(side * factor / 32) * 32) for side in (width, height)]
         if [width, height] != new:
             from PIL import Image as PillowImage
@@ -207,22 +219,30 @@ class ObservationModel:
         return _Prepared(tensor, torch.as_tensor(camera * np.tile(scale, 2), dtype=self._prior_mean.dtype), scale)
 
     def _parameters(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> RegionParameters:
-        p = self.config.predictors
-        features = encoding.features[row, region // p]
-        return self.calibration.apply(self.model.guide.parameters_at(features, region % p))
+        return self.calibration.apply(self.model.guide.parameters_at(encoding, row, region))
 
     def _detections(
         self, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float
-    ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-        """(row, region) of the regions above the threshold that survive non-maximum suppression, best first in a row."""
-        row, region = (logit > math.log(threshold / (1 - threshold))).nonzero(as_tuple=True)
+    ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"]]:
+        """Row, region and log odds of the objects above the threshold, best first in a row.
+
+        Regions whose boxes overlap describe one object, for which exactly one of them is responsible: the probability
+        that it is there is the sum of theirs. The most probable region answers for it.
+        """
+        least = min(threshold, CANDIDATE)
+        row, region = (logit > math.log(least / (1 - least))).nonzero(as_tuple=True)
         if len(region) == 0:
-            return row, region
+            return row, region, logit.new_empty(0)
         q = self._parameters(encoding, row, region)
         box = decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
-        kept = nms(box, logit[row, region], iou_threshold, group=row)
+        kept, stands_for = suppress(box, logit[row, region], iou_threshold, group=row)
+        probability = torch.zeros(len(row), dtype=torch.float64)
+        probability.index_add_(0, stands_for, torch.sigmoid(logit[row, region].double()))
+        probability = probability.clamp(max=1 - 1e-6)
+        kept = kept[probability[kept] > threshold]
+        kept = kept[torch.argsort(probability[kept], descending=True, stable=True)]
         kept = kept[torch.argsort(row[kept], stable=True)]
-        return row[kept], region[kept]
+        return row[kept], region[kept], torch.logit(probability[kept])
 
     def _responsible(
         self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
@@ -330,10 +350,18 @@ class ObservationModel:
             raise input_error("samples of the shape latent", got=samples, expected="at least 2, for a variance")
         noise = np.random.default_rng(seed).standard_normal((samples, 1, d))  # shared: the same answer in any company
         latent = q.shape_loc + q.shape_scale * torch.as_tensor(noise, dtype=q.shape_loc.dtype)
-        occupancy = self.decode(latent.flatten(0, 1).numpy()).reshape(samples, n, *(self.config.voxel_size,) * 3)
-        mean_shape = self.decode(q.shape_loc.numpy())
-        size = _extents(mean_shape) * diagonal.numpy()[:, None]
-        return occupancy.mean(0), occupancy.var(0, ddof=1), size
+        grid = (n,) + (self.config.voxel_size,) * 3
+        mean, variance, size = np.empty(grid, np.float32), np.empty(grid, np.float32), np.empty((n, 3))
+        latents, step = torch.cat((q.shape_loc[None], latent)), max(1, 64 // (samples + 1))
+        for first in range(0, n, step):  # a few objects at a time: all samples of all objects would not fit the cache
+            part = slice(first, first + step)
+            chunk = latents[:, part]
+            decoded = torch.sigmoid(self.model.story.decoder(chunk.flatten(0, 1))).unflatten(0, chunk.shape[:2])
+            middle = decoded[1:].mean(0)
+            squares = (decoded[1:] - middle).square_().sum(0)  # torch.var_mean takes 20 times as long here
+            mean[part], variance[part] = middle.numpy(), (squares / (samples - 1)).numpy()
+            size[part] = _extents(decoded[0].numpy()) * diagonal[part].numpy()[:, None]
+        return mean, variance, size
 
     def _category_extents(self) -> Float[np.ndarray, "labels 3"]:
         """Extents, in diagonals, of each category's mean shape."""

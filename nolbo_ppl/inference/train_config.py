@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.inference.elbo import PURE_BOUND
+from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.optimisation import OptimisationConfig
 from nolbo_ppl.inference.stages import Stage, scene_weights
+from nolbo_ppl.inference.weights import load
 from nolbo_ppl.models.config import PRESETS, ModelConfig
 
 DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
@@ -46,10 +47,13 @@ class TrainConfig:
     """Number of generated training scenes."""
     single_count: int = 1024
     """Number of generated scenes with one object, for the second stage."""
-    difficulty: Literal["easy", "standard", "full"] = "standard"
-    """Difficulty of the generated scenes."""
+    difficulty: Literal["easy", "standard", "full", "mixed"] = "standard"
+    """Difficulty of the generated scenes; `mixed` is half standard, half full."""
     backgrounds: Path | None = None
-    """Folder of photographs behind the generated scenes."""
+    """Folder of photographs behind the generated scenes (with `mixed`, behind the full ones)."""
+    initial: str | None = None
+    """Weights to start from: a name of shipped weights, or the folder of a model; the networks' configuration is theirs.
+    With `--shape-steps 0` the shape networks stay as they are."""
     cache: Path = DEFAULT_CACHE
     """Where generated scenes are kept."""
     seed: int = 0
@@ -109,7 +113,15 @@ class TrainConfig:
             raise input_error("held-out scenes without training scenes", do="give --scenes too")
 
     def model(self) -> ModelConfig:
-        """Configuration of the networks."""
+        """Configuration of the networks. Raises `InputError` where initial weights and other fields disagree."""
+        if self.initial is not None:
+            config = load(self.initial).config
+            if self.orientation not in (None, config.orientation) or self.latent_dim not in (None, config.latent_dim):
+                raise input_error(
+                    "initial weights of another form", got=f"orientation {config.orientation}, {config.latent_dim} dimensions",
+                    do="leave --orientation and --latent-dim out",
+                )
+            return config
         changes: dict[str, Any] = {}
         if self.orientation is not None:
             changes["orientation"] = self.orientation
@@ -126,7 +138,7 @@ class TrainConfig:
             Stage(
                 "shapes",
                 OptimisationConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
-                PURE_BOUND,
+                SHAPE_STAGE,
             ),
             Stage(
                 "single",

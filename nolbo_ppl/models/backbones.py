@@ -45,8 +45,8 @@ class Encoder(Protocol):
     stride: int
     channels: int
 
-    def __call__(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c gh gw"]:
-        """Features of every cell."""
+    def __call__(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b c gh gw"], tuple[Tensor, ...]]:
+        """Features of every cell, and finer maps for the second look (none for darknet19)."""
         ...
 
 
@@ -67,11 +67,14 @@ class TinyEncoder(nn.Module):
         self.deep = nn.Sequential(ConvUnit(c8, c16, 3, 2), *(ResidualBlock(c16) for _ in range(n16)))
         self.fold = nn.PixelUnshuffle(2)
         self.channels = c16 + 4 * c8
+        self.fine_channels, self.fine_strides = (c4, c8), (4, 8)
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c gh gw"]:
-        """Features of each 16 x 16 px cell."""
-        middle = self.middle(self.stem(image))
-        return torch.cat((self.deep(middle), self.fold(middle)), dim=1)
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b c gh gw"], tuple[Tensor, ...]]:
+        """Features of each 16 x 16 px cell, and the maps of strides 4 and 8."""
+        fine = self.stem(image)
+        middle = self.middle(fine)
+        deep = self.deep(middle)
+        return torch.cat((deep, self.fold(middle)), dim=1), (fine, middle)
 
 
 _DARKNET19: tuple[tuple[tuple[int, int], ...], ...] = (
@@ -90,6 +93,8 @@ class Darknet19Encoder(nn.Module):
 
     stride = 32
     channels = 1024
+    fine_channels: tuple[int, ...] = ()
+    fine_strides: tuple[int, ...] = ()
 
     def __init__(self) -> None:
         super().__init__()
@@ -104,9 +109,9 @@ class Darknet19Encoder(nn.Module):
         self.core = nn.Sequential(*layers)
         self.neck = nn.Sequential(*(ConvUnit(1024, 1024, 3) for _ in range(3)))
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 1024 gh gw"]:
+    def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b 1024 gh gw"], tuple[Tensor, ...]]:
         """Features of each 32 x 32 px cell; the first pooling follows the first convolution, the last the fifth stage."""
-        return self.neck(self.core(image))
+        return self.neck(self.core(image)), ()
 
 
 def make_encoder(config: ModelConfig) -> TinyEncoder | Darknet19Encoder:

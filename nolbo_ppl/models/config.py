@@ -24,12 +24,17 @@ class ModelConfig:
     """Category label of each instance."""
     encoder: Literal["tiny", "darknet19"] = "tiny"
     """Image encoder: a small residual network of stride 16 for CPUs, or the paper's darknet19 of stride 32."""
-    encoder_channels: tuple[int, int, int, int] = (16, 32, 80, 144)
+    encoder_channels: tuple[int, int, int, int] = (16, 32, 64, 128)
     """Channels of the tiny encoder at strides 2, 4, 8 and 16."""
-    encoder_blocks: tuple[int, int, int] = (1, 1, 2)
+    encoder_blocks: tuple[int, int, int] = (1, 2, 2)
     """Residual blocks of the tiny encoder at strides 4, 8 and 16."""
     head_width: int = 320
     """Width of the head's hidden layers (tiny encoder only; darknet19 has a linear head as the paper)."""
+    glimpse: int = 7
+    """Side of the grid of features sampled over each object's box, which refines its posterior; 0 for no second look
+    (darknet19, whose head is the paper's, has none)."""
+    glimpse_width: int = 96
+    """Channels of the second look, a multiple of 4."""
     predictors: int = 2
     """Predictors P of each cell; a scene of G x G cells has K = G G P regions."""
     image_size: int = 128
@@ -96,6 +101,13 @@ class ModelConfig:
             )
         if self.instances and self.latent_dim % 2:
             raise input_error("a latent split in two halves", got=self.latent_dim, expected="an even latent_dim")
+        if self.glimpse and self.encoder == "darknet19":
+            raise input_error("a second look of darknet19", got=f"glimpse={self.glimpse}", expected="glimpse=0")
+        if self.glimpse < 0 or self.glimpse_width < 4 or self.glimpse_width % 4:
+            raise input_error(
+                "second look", got=f"glimpse={self.glimpse}, glimpse_width={self.glimpse_width}",
+                expected="glimpse >= 0 and glimpse_width a positive multiple of 4",
+            )
         if self.image_size % 32 or self.image_size <= 0:
             raise input_error("image_size", got=self.image_size, expected="a positive multiple of 32")
         for name in ("decoder_channels", "voxel_encoder_channels"):
@@ -149,6 +161,7 @@ def nano() -> ModelConfig:
         encoder_channels=(8, 16, 32, 48),
         encoder_blocks=(0, 1, 1),
         head_width=96,
+        glimpse_width=32,
         image_size=64,
         prior_width=32,
         decoder_channels=(32, 16, 8),
@@ -160,6 +173,7 @@ def paper() -> ModelConfig:
     """The paper's network: darknet19, one orientation mode, 64^3 voxels, 448 px."""
     return ModelConfig(
         encoder="darknet19",
+        glimpse=0,
         image_size=448,
         voxel_size=64,
         decoder_channels=(512, 256, 128, 64),

@@ -38,6 +38,8 @@ class Encoding:
     """Log odds of q(o | I) of every region; region = cell * predictors + predictor."""
     rows: int
     columns: int
+    fine: tuple[Float[Tensor, "b _ _ _"], ...] = ()
+    """Finer maps of the encoder, for the second look at each object."""
 
 
 @dataclass
@@ -71,7 +73,9 @@ class Guide(nn.Module):
         super().__init__()
         self.config = config
         self.encoder = make_encoder(config)
-        self.head = RegionHead(self.encoder.channels, config)
+        self.head = RegionHead(
+            self.encoder.channels, config, self.encoder.fine_channels, self.encoder.fine_strides
+        )
         self._prior: Callable[[], LabelPrior] = lambda: prior  # owned by the story, shared here
         self.half_precision = False
         """Run encoder and head in bfloat16, everything after them in the weights' own precision."""
@@ -88,17 +92,28 @@ class Guide(nn.Module):
         if dtype == torch.float32:  # faster convolutions on CPUs
             x = x.contiguous(memory_format=torch.channels_last)
         with self._autocast():
-            maps = self.encoder(x)
+            maps, fine = self.encoder(x)
             features = maps.flatten(2).transpose(1, 2)
             logit = self.head.objectness(features).flatten(1)
-        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3])
+        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine)
 
-    def parameters_at(self, features: Float[Tensor, "n c"], predictor: Int[Tensor, " n"]) -> RegionParameters:
-        """Posterior parameters of given regions, from the features of their cells."""
+    def parameters_at(
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]
+    ) -> RegionParameters:
+        """Posterior parameters of given regions.
+
+        Args:
+            encoding: the encoded images.
+            row: the image of each region.
+            region: its number, cell * predictors + predictor.
+        """
+        cell, predictor = region // self.config.predictors, region % self.config.predictors
         with self._autocast():
-            raw = self.head(features)
-        raw = raw.to(self.head.objectness.weight.dtype)
-        return self.head.parameters_of(raw[torch.arange(len(raw)), predictor], self._prior().label_mean())
+            raw = self.head(encoding.features[row, cell])[torch.arange(len(row)), predictor]
+            raw = self.head.refine(
+                raw.to(self.head.objectness.weight.dtype), encoding.fine, row, cell, encoding.columns
+            )
+        return self.head.parameters_of(raw, self._prior().label_mean())
 
     def _raw(self, encoding: Encoding, cell: Int[Tensor, "b m"]) -> Float[Tensor, "b m predictors outputs"]:
         index = cell[..., None].expand(-1, -1, encoding.features.shape[-1])
@@ -117,10 +132,7 @@ class Guide(nn.Module):
         cell = cell_of(batch.box, encoding.rows, columns, stride)
         raw = self._raw(encoding, cell)
         with torch.no_grad():
-            start = sum(self.head.sizes[:4])
-            boxes = decode_box(
-                raw[..., start : start + 4], cell[..., None].expand(raw.shape[:3]), columns, self.config
-            )
+            boxes = decode_box(self.head.box_latent(raw), cell[..., None].expand(raw.shape[:3]), columns, self.config)
             iou = box_iou(boxes, batch.box[:, :, None])
             predictor, assigned = assign_predictors(cell, iou, batch.present)
             region = cell * self.config.predictors + predictor
@@ -143,8 +155,18 @@ class Guide(nn.Module):
                 ),
                 has_range=has_range,
             )
-        posterior = self.head.parameters_of(_select(raw, predictor), self._prior().label_mean())
+        posterior = self._posterior(_select(raw, predictor), encoding, cell, assigned)
         return ObservedScene(batch, encoding, assignment, posterior)
+
+    def _posterior(
+        self, raw: Float[Tensor, "b m outputs"], encoding: Encoding, cell: Int[Tensor, "b m"], assigned: Tensor
+    ) -> RegionParameters:
+        """Posterior parameters of every slot; the second look is taken at assigned objects only."""
+        row, slot = assigned.nonzero(as_tuple=True)
+        with self._autocast():
+            refined = self.head.refine(raw[row, slot], encoding.fine, row, cell[row, slot], encoding.columns)
+        raw = raw.index_put((row, slot), refined.to(raw.dtype))
+        return self.head.parameters_of(raw, self._prior().label_mean())
 
     def forward(self, scene: ObservedScene) -> None:
         """The Pyro guide: the sites of `Story`, amortised."""

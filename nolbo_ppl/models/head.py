@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.glimpse import Glimpse
+from nolbo_ppl.models.scene import decode_box
 from nolbo_ppl.models.shape import bounded_exp
 
 
@@ -49,11 +52,13 @@ class RegionParameters:
 class RegionHead(nn.Module):
     """Features -> objectness of every region, and the raw outputs of the regions that are asked for.
 
-    The small encoder has a hidden part (two layers with layer norm), run only where it is wanted: a scene has far more
-    cells than objects. darknet19 has the paper's linear 1 x 1 head without bias.
+    The small encoder has a hidden part (two layers with layer norm) and a second look at the object's box, run only where
+    they are wanted: a scene has far more cells than objects. darknet19 has the paper's linear 1 x 1 head without bias.
     """
 
-    def __init__(self, channels: int, config: ModelConfig) -> None:
+    def __init__(
+        self, channels: int, config: ModelConfig, fine_channels: Sequence[int] = (), fine_strides: Sequence[int] = ()
+    ) -> None:
         super().__init__()
         self.config = config
         d, modes = config.latent_dim, config.azimuth_components
@@ -73,7 +78,37 @@ class RegionHead(nn.Module):
             )  # fmt: skip
             nn.init.constant_(self.objectness.bias, -4.0)
             nn.init.normal_(last.weight, std=0.02)
+        self.glimpse: Glimpse | None = None
+        if config.glimpse:
+            self.glimpse = Glimpse(sum(fine_channels), fine_strides, sum(self.sizes) - self.sizes[4], config)
         self.register_buffer("start", self._start(), persistent=False)
+
+    def box_latent(self, raw: Float[Tensor, "*n outputs"]) -> Float[Tensor, "*n 4"]:
+        """Mean of the box latent among raw outputs."""
+        first = sum(self.sizes[:4])
+        return raw[..., first : first + 4]
+
+    def refine(
+        self, raw: Float[Tensor, "n outputs"], maps: Sequence[Tensor], row: Int[Tensor, " n"], cell: Int[Tensor, " n"],
+        columns: int,
+    ) -> Float[Tensor, "n outputs"]:
+        """Raw outputs after the second look at each region's own box; the box itself stays as it is.
+
+        Args:
+            raw: outputs of the regions from their cells.
+            maps: the encoder's finer maps.
+            row: the image of each region.
+            cell: the cell of each region.
+            columns: cells in a row of the image.
+        """
+        if self.glimpse is None:
+            return raw
+        place = self.box_latent(raw).detach()
+        box = decode_box(place, cell, columns, self.config)
+        change = self.glimpse(maps, row, box, place.clamp(-8, 8)).to(raw.dtype)
+        first = sum(self.sizes[:4])
+        keep = change.new_zeros(len(change), self.sizes[4])
+        return raw + torch.cat((change[:, :first], keep, change[:, first:]), -1)
 
     def _start(self) -> Float[Tensor, "predictors outputs"]:
         """Where the outputs start.

@@ -47,6 +47,9 @@ class ShapeStory(nn.Module):
                 instance = torch.where(batch.instance < 0, len(prior.instance_category), batch.instance)
                 mean = torch.cat((mean, prior.instance_mean()[instance][None]), -1)
             latent = pyro.sample("shape_latent", dist.Normal(mean, torch.ones_like(mean)).to_event(1))
+            category = latent[..., : prior.category_dim]
+            squared = (category[..., None, :] - prior.category_mean()).square().sum(-1)
+            pyro.sample("shape_label", dist.Categorical(logits=-0.5 * squared), obs=batch.category[None])
         logits = self.story.decoder(latent[0])
         voxel_site(logits, unpack_bits(batch.voxels, size).to(logits.dtype))
 

@@ -16,6 +16,7 @@ from nolbo_ppl.data.cache import CachedScenes, cache_key, write_cache
 from nolbo_ppl.data.loader import batch_indices, prefetch, render_batch, shuffled_batches, streamed_batches
 from nolbo_ppl.data.scene_config import easy, standard
 from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.data.supply import Joined
 from nolbo_ppl.data.workers import parallel
 from nolbo_ppl.errors import InputError
 
@@ -53,6 +54,28 @@ def test_cached_scenes_are_the_rendered_ones(source: SceneSource, cached: Cached
     assert len(cached) == 20 and cached.size == 32
     with pytest.raises(InputError, match=r"no such scene in the cache: got \[20\], expected 0 to 19"):
         cached.batch([20])
+
+
+def test_joined_caches_are_one_data_set(cached: CachedScenes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes of both in any order, shapes of both once; the pool of shapes is the same."""
+    monkeypatch.setattr(cache, "BLOCK", 8)
+    other = write_cache(tmp_path, SceneSource(easy(32), seed=5, instances=2), 8)
+    joined = Joined([cached, other])
+    assert len(joined) == 28
+    index = np.array([3, 25, 19, 20, 0, 27])
+    batch = joined.batch(index)
+    for row, number in enumerate(index):
+        single = cached.batch([number]) if number < 20 else other.batch([number - 20])
+        for name, array in single.items():
+            np.testing.assert_array_equal(batch[name][row], array[0], err_msg=name)
+    number, packed, category = joined.shapes()
+    assert (np.diff(number) > 0).all()
+    assert set(number) == set(cached.shapes()[0]) | set(other.shapes()[0])
+    for part in (cached, other):
+        for n, voxels, label in zip(*part.shapes()):
+            row = int(np.searchsorted(number, n))
+            np.testing.assert_array_equal(packed[row], voxels)
+            assert category[row] == label
 
 
 def test_shapes_of_a_cache(source: SceneSource, cached: CachedScenes) -> None:

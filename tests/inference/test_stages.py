@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND
+from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, SHAPE_STAGE, SceneElbo
 from nolbo_ppl.inference.monitor import held_out
 from nolbo_ppl.inference.optimisation import OptimisationConfig
 from nolbo_ppl.inference.stages import OBJECTIVES, Stage, StageRun, scene_weights, seeded_noise, shorten
@@ -73,6 +73,37 @@ def test_stage_of_shapes_leaves_the_image_guide_alone() -> None:
     for part in ("shape_guide", "story.decoder", "story.prior"):
         assert any(name.startswith(part) for name in changed), part
     assert losses[-1] < losses[0]
+
+
+def test_the_label_of_a_shape_latent_by_bayes() -> None:
+    """`shape_label`: log p(l | z) of the mixture with equal weights, at the sample that the noise stands for."""
+    model = tiny_model().eval()
+    scene = random_batch(tiny_config(), 1, 4)
+    batch = ShapeBatch(scene.voxels[0], scene.category[0], scene.instance[0], scene.noise[0])
+    terms = SceneElbo(SHAPE_STAGE).terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
+    loc, scale = model.shape_guide.posterior(batch.voxels)
+    z, mean = loc + scale * batch.noise, model.story.prior.category_mean()
+    density = torch.distributions.MultivariateNormal(mean, torch.eye(mean.shape[1])).log_prob(z[:, None]).exp()
+    own = density[torch.arange(4), batch.category] / density.sum(1)
+    torch.testing.assert_close(terms["shape_label"], own.log().sum())
+
+
+def test_the_label_of_a_shape_latent_keeps_categories_apart() -> None:
+    """With the term, the shape stage makes the label of a latent more certain than without it."""
+    scene = random_batch(tiny_config(), 1, 4)
+    batch = ShapeBatch(scene.voxels[0], scene.category[0], scene.instance[0], scene.noise[0])
+    certain = {}
+    for weight in (0.0, 50.0):
+        model = tiny_model()
+        weights = {"shape_kl": 1.0, "voxels": 0.01} | ({"shape_label": weight} if weight else {})
+        run = StageRun(model, Stage("shapes", QUICK, weights))
+        for _ in range(4):
+            run.step(batch)
+        model.eval()
+        elbo = SceneElbo(SHAPE_STAGE)
+        terms = elbo.terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
+        certain[weight] = float(terms["shape_label"].detach())
+    assert certain[50.0] > certain[0.0] + 1e-3
 
 
 @pytest.mark.parametrize("objective", ["inclusive", "elbo", "paper"])

@@ -63,8 +63,9 @@ def test_darknet19_takes_any_multiple_of_32() -> None:
     encoder = Darknet19Encoder().eval()
     with torch.no_grad():
         for height, width in ((32, 32), (64, 32), (96, 64)):
-            out = encoder(torch.zeros(1, 3, height, width))
+            out, fine = encoder(torch.zeros(1, 3, height, width))
             assert out.shape == (1, 1024, height // 32, width // 32)
+            assert fine == ()
 
 
 def test_paper_decoder_makes_64_cubed() -> None:
@@ -85,15 +86,17 @@ def test_paper_decoder_makes_64_cubed() -> None:
 @pytest.mark.parametrize("size", [(64, 64), (32, 96), (160, 64)])
 def test_tiny_encoder_shapes(size: tuple[int, int]) -> None:
     encoder = TinyEncoder(tiny_config()).eval()
-    out = encoder(torch.zeros(2, 3, *size))
+    out, fine = encoder(torch.zeros(2, 3, *size))
     assert out.shape == (2, encoder.channels, size[0] // 16, size[1] // 16)
+    for features, channels, stride in zip(fine, encoder.fine_channels, encoder.fine_strides, strict=True):
+        assert features.shape == (2, channels, size[0] // stride, size[1] // stride)
 
 
 def test_a_cell_sees_its_own_surroundings() -> None:
     """The gradient of one cell's features with respect to the image is centred on that cell."""
     encoder = TinyEncoder(tiny_config()).eval()
     image = torch.randn(1, 3, 160, 160, requires_grad=True)
-    encoder(image)[0, :, 7, 2].sum().backward()
+    encoder(image)[0][0, :, 7, 2].sum().backward()
     seen = image.grad.abs().sum((0, 1))
     y, x = (torch.arange(160) + 0.5)[:, None], (torch.arange(160) + 0.5)[None]
     centre = (seen * y).sum() / seen.sum(), (seen * x).sum() / seen.sum()

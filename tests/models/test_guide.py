@@ -79,10 +79,9 @@ def test_observe_picks_the_predictor_with_the_highest_iou() -> None:
     cell = cell_of(batch.box, 4, 4, 16)
     chosen = set()
     for b, m in batch.present.nonzero().tolist():
-        features = scene.encoding.features[b, cell[b, m]]
         boxes, rows = [], []
         for p in range(2):
-            q = model.guide.parameters_at(features[None], torch.tensor([p]))
+            q = model.guide.parameters_at(scene.encoding, torch.tensor([b]), cell[b, m][None] * 2 + p)
             boxes.append(decode_box(q.box_loc, cell[b, m][None], 4, config)[0])
             rows.append(q)
         best = int(box_iou(torch.stack(boxes), batch.box[b, m]).argmax())
@@ -103,7 +102,7 @@ def test_encoding_lays_regions_out_row_by_row() -> None:
     image = torch.randint(0, 256, (1, 3, 32, 96), dtype=torch.uint8)
     encoding = model.guide.encode(image)
     assert (encoding.rows, encoding.columns) == (2, 6)
-    maps = model.guide.encoder((image.double() - 127.5) / 64)
+    maps, _ = model.guide.encoder((image.double() - 127.5) / 64)
     logits = model.guide.head.objectness(maps[0].permute(1, 2, 0))
     torch.testing.assert_close(encoding.objectness_logit[0], logits.flatten())
     torch.testing.assert_close(encoding.features[0, 1 * 6 + 4], maps[0, :, 1, 4])
