@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
 
 from nolbo_ppl.data.materials import Material
 from nolbo_ppl.data.textures import PLANE_PATTERNS
+
+
+@cache
+def _device() -> EmbreeDevice:
+    """The process's one Embree device: a device for every mesh exhausts memory in the long run."""
+    return EmbreeDevice()
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,7 @@ class Mesh:
     @cached_property
     def scene(self) -> EmbreeScene:
         """The Embree scene of this mesh alone."""
-        scene = EmbreeScene()
+        scene = EmbreeScene(_device())
         TriangleMesh(scene, np.ascontiguousarray(self.vertices[self.faces], dtype=np.float32))
         return scene
 
