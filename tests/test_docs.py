@@ -1,0 +1,160 @@
+"""What the documents say works: command lines parse, Python blocks run, the site builds without a warning."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+
+from nolbo_ppl.cli import VERBS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`(nolbo [a-z]+[^`\n]*?)`")
+PROSE = {"VERB"}
+"""In place of a verb: the command stands for all of them."""
+
+
+def blocks(page: Path, *languages: str) -> Iterator[str]:
+    """Fenced blocks of a page in these languages ("" for none)."""
+    for language, text in FENCE.findall(page.read_text(encoding="utf-8")):
+        if language in languages:
+            yield text
+
+
+def commands(page: Path) -> list[str]:
+    """Command lines of `nolbo` on a page: whole ones in blocks, and those in the text that have options."""
+    found = []
+    for text in blocks(page, "", "bash", "sh", "console"):
+        for line in text.replace("\\\n", " ").splitlines():
+            line = re.sub(r"\s#.*$", "", line).strip().removeprefix("$ ")
+            line = re.sub(r"^(\w+=\S+ )*(\.venv/bin/)?", "", line)
+            if line.startswith("nolbo "):
+                found.append(line)
+            elif "-m nolbo_ppl." in line and "..." not in line:  # torchrun ... -m nolbo_ppl.train OPTIONS
+                found.append("nolbo " + line.split("-m nolbo_ppl.", 1)[1])
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    found += [line for line in INLINE.findall(text) if " --" in line and "..." not in line and "[" not in line]
+    return [line for line in found if line.split()[1] not in PROSE and "--help" not in line]
+
+
+class Parsed(Exception):
+    """The command line was understood."""
+
+
+@pytest.fixture
+def parse_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Verbs stop once their arguments are parsed."""
+    real = tyro.cli
+
+    def cli(*args: Any, **kwargs: Any) -> Any:
+        real(*args, **kwargs)
+        raise Parsed
+
+    monkeypatch.setattr(tyro, "cli", cli)
+
+
+@pytest.mark.usefixtures("parse_only")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_line_is_understood(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for line in commands(page):
+        verb, *arguments = shlex.split(line)[1:]
+        assert verb in VERBS, f"{line!r}: no such verb"
+        module = import_module(f"nolbo_ppl.{verb}")
+        if any(word.isupper() or word == "..." for word in arguments if not word.startswith("-")):
+            arguments = ["1" if word.isupper() else word for word in arguments]  # --seed N, --out DIR
+        try:
+            module.main(arguments)
+        except Parsed:
+            continue
+        except SystemExit:
+            # In prose only some options are named: what is missing may be missing, what is there must be known.
+            error = capsys.readouterr().err
+            inside = line not in "".join(blocks(page, "", "bash", "sh", "console"))
+            assert inside and "Required" in error and "Unrecognized" not in error, f"{line!r}:\n{error}"
+
+
+def test_the_parser_would_refuse_a_wrong_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        import_module("nolbo_ppl.observe").main(["--images", "a", "--out", "b", "--no-such-option", "1"])
+    assert "no-such-option" in capsys.readouterr().err
+
+
+HOW_TOS = sorted((ROOT / "docs").rglob("*.md"))
+LONG = ("run(Kitchen", "scenes/images/000000.png", "solve(SlamProblem(odometry, table)")
+"""Blocks that need files or minutes of their own; the tests of their subjects run the same calls."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", [page for page in HOW_TOS if any(blocks(page, "python"))], ids=lambda page: str(page.relative_to(ROOT))
+)
+def test_python_blocks_run_in_order(page: Path, tmp_path: Path) -> None:
+    code = []
+    for text in blocks(page, "python"):
+        compile(text, str(page), "exec")
+        if not any(mark in text for mark in LONG):
+            code.append(text)
+    (tmp_path / "block.py").write_text("\n".join(code), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error::SyntaxWarning", "block.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_json_blocks_are_json() -> None:
+    for page in PAGES:
+        for text in blocks(page, "json"):
+            json.loads(text)
+
+
+def test_links_between_documents_lead_somewhere() -> None:
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            if "://" not in target and not target.startswith("#"):
+                assert (page.parent / target.split("#")[0]).exists(), f"{page.name}: {target}"
+
+
+@pytest.mark.slow
+def test_own_categories_train_as_the_how_to_says(tmp_path: Path) -> None:
+    """The derived configuration of docs/howto/own-categories.md, with the folder of docs/howto/own-data.md."""
+    own_data, own_categories = ROOT / "docs/howto/own-data.md", ROOT / "docs/howto/own-categories.md"
+    folder = next(text for text in blocks(own_data, "python") if "scenes.jsonl" in text)
+    folder = folder.replace('"my_folder"', '"kitchen"').replace('"car"', '"mug"').replace("range(4)", "range(12)")
+    kitchen = next(text for text in blocks(own_categories, "python") if "class Kitchen" in text)
+    short = (
+        'preset="nano", shape_steps=2, single_steps=0, scene_steps=2, batch=4, workers=1, validation=Path("kitchen")'
+    )
+    kitchen = kitchen.replace('validation=Path("kitchen_held_out")', short)
+    (tmp_path / "train.py").write_text(folder + kitchen, encoding="utf-8")
+    subprocess.run([sys.executable, "train.py"], cwd=tmp_path, check=True, timeout=300, capture_output=True)
+    config = json.loads((tmp_path / "runs/kitchen/model/config.json").read_text())
+    assert config["model"]["categories"] == ["box", "mug"]
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed: pip install -e '.[docs]'")
+    import os
+
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")], cwd=ROOT,
+        env={**os.environ, "NOLBO_DOCS_EXECUTE": "0", "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, timeout=600,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    reference = (tmp_path / "site/reference/inference_slam/index.html").read_text(encoding="utf-8")
+    assert "SlamConfig" in reference and "Standard deviation of each angle of one odometry step" in reference
+    assert "<math" in (tmp_path / "site/em/index.html").read_text(encoding="utf-8")
+    commands_page = (tmp_path / "site/reference/commands/index.html").read_text(encoding="utf-8")
+    assert all(f"nolbo {verb}" in commands_page for verb in VERBS)
