@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -96,14 +97,14 @@ def test_the_label_of_a_shape_latent_keeps_categories_apart() -> None:
     for weight in (0.0, 50.0):
         model = tiny_model()
         weights = {"shape_kl": 1.0, "voxels": 0.01} | ({"shape_label": weight} if weight else {})
-        run = StageRun(model, Stage("shapes", QUICK, weights))
-        for _ in range(4):
+        run = StageRun(model, Stage("shapes", replace(QUICK, steps=20), weights))
+        for _ in range(20):
             run.step(batch)
         model.eval()
         elbo = SceneElbo(SHAPE_STAGE)
         terms = elbo.terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
         certain[weight] = float(terms["shape_label"].detach())
-    assert certain[50.0] > certain[0.0] + 1e-3
+    assert certain[50.0] > certain[0.0] + 0.1, certain
 
 
 @pytest.mark.parametrize("objective", ["inclusive", "elbo", "paper"])
