@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from nolbo_ppl import __version__
 from nolbo_ppl.data.folder import SceneFolder
+from nolbo_ppl.data.instance_views import InstanceViews
 from nolbo_ppl.data.scene_config import preset
 from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.truth import FolderScenes, GeneratedScenes, Scenes
@@ -34,6 +35,7 @@ from nolbo_ppl.metrics.figures import (
     figures,
 )
 from nolbo_ppl.metrics.intervals import Estimate
+from nolbo_ppl.metrics.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
 from nolbo_ppl.models.config import ModelConfig
 
 SEED = 9001
@@ -94,16 +96,20 @@ def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
         if config.cad is not None or config.backgrounds is not None:
             raise input_error("a folder of scenes and what to generate others from", do="drop --cad, --backgrounds")
         return FolderScenes(SceneFolder(config.scenes, categories, size=model_config.image_size), config.count)
+    return GeneratedScenes(open_source(config, model_config), config.count, categories)
+
+
+def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSource:
+    """Where generated scenes and views of instances come from."""
     cad = None
     if config.cad is not None:
         from nolbo_ppl.data.cad import load_cad_folder
 
-        cad = tuple(load_cad_folder(config.cad, categories))
-    source = SceneSource(
+        cad = tuple(load_cad_folder(config.cad, model_config.categories))
+    return SceneSource(
         preset(config.difficulty, model_config.image_size), seed=config.seed, cad=cad,
         backgrounds=None if config.backgrounds is None else str(config.backgrounds),
     )  # fmt: skip
-    return GeneratedScenes(source, config.count, categories)
 
 
 @dataclass(frozen=True)
@@ -115,6 +121,8 @@ class Evaluation:
     figures: dict[str, Estimate]
     scenes: int
     categories: tuple[str, ...]
+    retrieval: RetrievalRecords | None = None
+    """Instances found again, where that was asked for."""
 
 
 def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: Scenes) -> Evaluation:
@@ -157,9 +165,36 @@ def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: S
     return Evaluation(records, detections, estimates, len(scenes), categories)
 
 
+def measure_retrieval(
+    config: EvaluateConfig, model: ObservationModel | Pyramid, views: InstanceViews
+) -> RetrievalRecords:
+    """Render two views of every instance, take the shape latent at the true box, and seek each among the others.
+
+    Raises:
+        InputError: no category has two instances.
+    """
+    instances = views.instances
+    if not instances:
+        raise input_error("instances to find again", got=0, expected="at least two of a category")
+    means, scales = [], []
+    step = max(1, config.batch // 2)
+    for start in tqdm(range(0, len(instances), step), desc="retrieval", unit="batch", disable=None):
+        pairs = [views.pair(*instance) for instance in instances[start : start + step]]
+        flat = [view for pair in pairs for view in pair]
+        answers = model.observe_boxes(
+            [view.image for view in flat], np.array([view.intrinsics for view in flat]), [view.box for view in flat],
+            decode=False, batch=config.batch,
+        )  # fmt: skip
+        means.append(np.array([answer.latent[0] for answer in answers]).reshape(len(pairs), 2, -1))
+        scales.append(np.array([answer.latent_scale[0] for answer in answers]).reshape(len(pairs), 2, -1))
+    category = np.array([views.categories.index(name) for name, _ in instances])
+    return retrieve(np.concatenate(means), np.concatenate(scales), category, model.prior_mean())
+
+
 def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
     """The content of metrics.json: figures by name, their intervals and counts, tables, and what they came from."""
     estimates = evaluation.figures
+    found = evaluation.retrieval
     return {
         **{name: one.value for name, one in estimates.items()},
         "intervals": {name: None if one.low is None else [one.low, one.high] for name, one in estimates.items()},
@@ -169,6 +204,7 @@ def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
         "by_category": category_table(evaluation.objects, evaluation.detections, evaluation.categories),
         "by_difficulty": difficulty_table(evaluation.objects),
         "confusion": confusion(evaluation.objects, len(evaluation.categories)).tolist(),
+        "retrieval": None if found is None else retrieval_table(found, evaluation.categories),
         "categories": list(evaluation.categories),
         "configuration": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()},
         "seeds": {"scenes": config.seed if config.scenes is None else None, "bootstrap": config.seed},
@@ -181,10 +217,10 @@ def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
 
 def table(evaluation: Evaluation) -> str:
     """The figures with their 95 % intervals, and the main ones by category, as text."""
-    lines = [f"{'figure':<24}{'value':>9}   {'95 % interval':<20}{'of':>7}"]
+    lines = [f"{'figure':<32}{'value':>9}   {'95 % interval':<20}{'of':>7}"]
     for name, one in evaluation.figures.items():
         interval = "" if one.low is None or one.high is None else f"[{one.low:.3f}, {one.high:.3f}]"
-        lines.append(f"{name:<24}{_number(one.value):>9}   {interval:<20}{one.count:>7}")
+        lines.append(f"{name:<32}{_number(one.value):>9}   {interval:<20}{one.count:>7}")
     columns = ("ap50", "category_accuracy", "acc_pi6", "med_err_deg", "voxel_iou", "voxel_iou_gain")
     lines += ["", f"{'category':<14}{'objects':>8}" + "".join(f"{name:>19}" for name in columns)]
     for name, row in category_table(evaluation.objects, evaluation.detections, evaluation.categories).items():
@@ -203,6 +239,12 @@ def run(config: EvaluateConfig) -> Evaluation:
         model = Pyramid(model, config.sizes)
     scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
+    if config.retrieval:
+        views = InstanceViews(open_source(config, model.config), config.gallery, model.config.categories)
+        found = measure_retrieval(config, model, views)
+        rng = np.random.default_rng([config.seed, 1])
+        estimates = {**evaluation.figures, **retrieval_figures(found, rng, config.resamples)}
+        evaluation = replace(evaluation, figures=estimates, retrieval=found)
     write_json(config.out / "metrics.json", metrics(evaluation, config))
     if config.pictures:
         from nolbo_ppl.viz.evaluation import write_plots

@@ -32,12 +32,12 @@ class Pyramid:
         sizes: longer sides, px, each image is brought to.
 
     Raises:
-        InputError: no size, or one that is not positive.
+        InputError: no size, or one that is no positive multiple of 32.
     """
 
     def __init__(self, model: ObservationModel, sizes: Sequence[int]) -> None:
-        if not sizes or min(sizes) < 32:
-            raise input_error("sizes of the images", got=tuple(sizes), expected="one or more, each at least 32 px")
+        if not sizes or any(size <= 0 or size % 32 for size in sizes):
+            raise input_error("sizes of the images", got=tuple(sizes), expected="positive multiples of 32, one or more")
         self.model, self.sizes = model, tuple(sorted(set(sizes)))
         self.config = model.config
         self.decode, self.shape_posterior, self.prior_mean = model.decode, model.shape_posterior, model.prior_mean
