@@ -102,16 +102,24 @@ def fingerprints(stages: Sequence[Stage]) -> dict[str, str]:
 
 
 def run_stages(
-    folder: Path, stages: Sequence[Stage], configuration: Mapping[str, Any], versions: Mapping[str, str]
+    folder: Path, stages: Sequence[Stage], configuration: Mapping[str, Any], versions: Mapping[str, str],
+    seconds: dict[str, float],
 ) -> RunRecord:
     """Run what is not there yet, in order; an interrupted stage leaves nothing, and complete ones before it stay.
+
+    Args:
+        folder: the run.
+        stages: what to do.
+        configuration: options, for `run.json`.
+        versions: of what does it, for `run.json`.
+        seconds: filled with the time of every complete stage as they end, so that later stages can tell it.
 
     Raises:
         InputError: the folder holds something else than a run.
     """
     before = recorded(folder)
     wanted = fingerprints(stages)
-    record = RunRecord(configuration, versions)
+    record = RunRecord(configuration, versions, seconds)
     first = 0
     for stage in stages:
         if before.get("fingerprints", {}).get(stage.name) != wanted[stage.name] or not stage.complete(folder):

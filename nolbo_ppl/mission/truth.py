@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.pose import quaternion_to_matrix
-from nolbo_ppl.io import read_json, read_jsonl
 from nolbo_ppl.metrics.detection import match_image
+
+if TYPE_CHECKING:
+    from nolbo_ppl.data.drive import DriveFrame
 
 LEAST_SIDE = 12.0
 """Objects whose box is smaller than this, px, need not be found."""
@@ -72,61 +73,53 @@ class DriveTruth:
         return len(self.names)
 
 
-def _frame(objects: Sequence[Mapping[str, Any]], number: Mapping[str, int], file: Path, line: int) -> TrueFrame:
-    for thing in objects:
-        if thing.get("id") not in number:
-            raise input_error("an object that objects.json does not know", got=thing.get("id"), file=file, line=line)
-    n = len(objects)
-    quaternion = np.array([thing["rotation"] for thing in objects], dtype=np.float64).reshape(n, 4)
+def _frame(seen: DriveFrame, number: Mapping[str, int], file: Path) -> TrueFrame:
+    n = len(seen.ids)
+    if any(one.position is None or one.R_camera_object is None for one in seen.objects):
+        raise input_error("an object without position or rotation", got=seen.image.name, expected="both", file=file)
     return TrueFrame(
-        object=np.array([number[thing["id"]] for thing in objects], dtype=np.int64),
-        box=np.array([thing["box"] for thing in objects], dtype=np.float64).reshape(n, 4),
-        position=np.array([thing["position"] for thing in objects], dtype=np.float64).reshape(n, 3),
-        R_camera_object=quaternion_to_matrix(quaternion) if n else np.zeros((0, 3, 3)),
-        visibility=np.array([thing.get("visibility", 1.0) for thing in objects], dtype=np.float64),
+        object=np.array([number[name] for name in seen.ids], dtype=np.int64),
+        box=np.array([one.box for one in seen.objects], dtype=np.float64).reshape(n, 4),
+        position=np.array([one.position for one in seen.objects], dtype=np.float64).reshape(n, 3),
+        R_camera_object=np.array([one.R_camera_object for one in seen.objects], dtype=np.float64).reshape(n, 3, 3),
+        visibility=np.array([one.visibility for one in seen.objects], dtype=np.float64),
     )
 
 
-def read_truth(drive: Path, images: Sequence[str]) -> DriveTruth:
+def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
     """True objects of a drive folder, frame by frame for the given images.
 
     Args:
-        drive: folder with `objects.json`, `scenes.jsonl` and `voxels.npz`.
+        folder: the drive (`nolbo drive`).
         images: names of the keyframes' images; the last part of a path decides.
 
     Raises:
-        InputError: a file is missing or malformed, or an image has no line in `scenes.jsonl`.
+        InputError: a file is missing or malformed, or an image is not one of the drive's.
     """
-    things = read_json(drive / "objects.json")
-    try:
-        names = tuple(str(thing["id"]) for thing in things)
-        poses = np.array([thing["T_world_object"] for thing in things], dtype=np.float64).reshape(-1, 4, 4)
-        diagonal = np.array([thing["diagonal"] for thing in things], dtype=np.float64)
-        category, instance = (tuple(str(thing[key]) for thing in things) for key in ("category", "instance"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise input_error("not the objects of a drive", got=repr(error), file=drive / "objects.json") from None
-    number = {name: i for i, name in enumerate(names)}
-    scenes, by_image = drive / "scenes.jsonl", {}
-    wanted = {Path(image).name for image in images}
-    for line, row in read_jsonl(scenes):
-        image = Path(str(row.get("image"))).name
-        if image in wanted:
-            try:
-                by_image[image] = _frame(row["objects"], number, scenes, line)
-            except (KeyError, TypeError) as error:
-                raise input_error("not a line of a drive", got=repr(error), file=scenes, line=line) from None
+    from nolbo_ppl.data.drive import read_drive  # delayed: it brings the renderer
+
+    drive = read_drive(folder)
+    things = drive.objects
+    number = {thing.id: i for i, thing in enumerate(things)}
+    by_image = {seen.image.name: seen for seen in drive.frames}
     missing = [image for image in images if Path(image).name not in by_image]
     if missing:
-        raise input_error("truth lacks an image", got=missing[0], expected="a line in scenes.jsonl", file=scenes)
-    with np.load(drive / "voxels.npz", allow_pickle=False) as arrays:
-        packed = {name: arrays[name] for name in arrays.files}
+        raise input_error("not an image of the drive", got=missing[0], expected=f"one of {len(drive)} images", file=folder)
+    packed = drive.voxels()
+    without = sorted({thing.instance for thing in things} - set(packed))
+    if without:
+        raise input_error("a true shape is missing", got=without[0], expected="a grid for every instance", file=folder)
     return DriveTruth(
-        names, category, instance, poses, diagonal,
-        symmetry=np.array([thing.get("symmetry", 1) for thing in things], dtype=np.int64),
-        moving=np.array([thing.get("moving", False) for thing in things], dtype=bool),
+        names=tuple(thing.id for thing in things),
+        category=tuple(thing.category for thing in things),
+        instance=tuple(thing.instance for thing in things),
+        T_world_object=np.array([thing.T_world_object for thing in things]).reshape(-1, 4, 4),
+        diagonal=np.array([thing.diagonal for thing in things], dtype=np.float64),
+        symmetry=np.array([thing.symmetry for thing in things], dtype=np.int64),
+        moving=np.array([thing.moving for thing in things], dtype=bool),
         packed=packed,
-        frames=tuple(by_image[Path(image).name] for image in images),
-    )  # fmt: skip
+        frames=tuple(_frame(by_image[Path(image).name], number, folder) for image in images),
+    )
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from nolbo_ppl.inference.observations import Observations, ViewpointModes
 CAMERA = np.array([100.0, 100.0, 96.0, 48.0])
 SIZE = (192, 96)
 DIAGONAL = 2.0
-CATEGORIES = ("c0", "c1", "c2")
+CATEGORIES = ("bus", "car", "chair")
 
 
 def ellipsoids(latent: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def frame_objects(position: np.ndarray, R: np.ndarray, seen: np.ndarray, categor
     """Objects of one line of scenes.jsonl."""
     box = boxes_of(position[seen]) if len(seen) else np.zeros((0, 4))
     return [
-        {"id": f"O{i}", "category": f"c{category[i]}", "instance": f"shape-{i}", "box": box[k].tolist(),
+        {"id": f"O{i}", "category": CATEGORIES[category[i]], "instance": f"shape-{i}", "box": box[k].tolist(),
          "rotation": matrix_to_quaternion(R[i]).tolist(), "position": position[i].tolist(), "size": DIAGONAL,
          "visibility": 1.0, "symmetry": 1}
         for k, i in enumerate(seen)
@@ -132,12 +132,12 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDrive:
         position = transform(inverse(pose), world.position)
         R = pose[:3, :3].T @ world.rotation
         distance = np.linalg.norm(position, axis=1)
-        seen = (distance > 2) & (distance < 16) & (position[:, 2] > 0) & (np.abs(position[:, 0]) < position[:, 2])
+        seen = (distance > 2) & (distance < 16) & (position[:, 2] > 0) & (np.abs(position[:, 0]) < 0.95 * position[:, 2])
         objects = frame_objects(position, R, np.flatnonzero(seen), world.category)
         lines.append({"image": f"images/{t:06d}.png", "intrinsics": CAMERA.tolist(), "objects": objects})
     (folder / "scenes.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n")
     things = [
-        {"id": f"O{i}", "category": f"c{world.category[i]}", "instance": f"shape-{i}", "symmetry": 1, "diagonal": DIAGONAL,
+        {"id": f"O{i}", "category": CATEGORIES[world.category[i]], "instance": f"shape-{i}", "symmetry": 1, "diagonal": DIAGONAL,
          "T_world_object": make_pose(world.rotation[i], world.position[i]).tolist(), "dimensions": [0.8, 0.8, 0.8],
          "moving": False}
         for i in range(len(world.position))
@@ -150,4 +150,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDrive:
     (folder / "times.txt").write_text("\n".join(f"{0.1 * t:.3f}" for t in range(len(truth))) + "\n")
     write_trajectory(folder / "truth.txt", Trajectory(truth))
     write_trajectory(folder / "odometry.txt", Trajectory(simulated.odometry))
-    return SimulatedDrive(folder, KnowingModel(simulated.observations, world.latent), truth, simulated.object_of)
+    (folder / "drive.json").write_text("{}")
+    table = simulated.observations
+    table = replace(table, category=tuple(CATEGORIES[int(str(name)[1:])] for name in table.category))
+    return SimulatedDrive(folder, KnowingModel(table, world.latent), truth, simulated.object_of)

@@ -66,15 +66,24 @@ def test_hardly_seen_objects_count_neither_way() -> None:
 @pytest.mark.parametrize(
     ("file", "change", "match"),
     [
-        ("objects.json", "[]", r"scenes.jsonl:\d+: an object that objects.json does not know"),
-        ("objects.json", '[{"id": "O0"}]', "not the objects of a drive"),
-        ("scenes.jsonl", "", "truth lacks an image"),
-        ("scenes.jsonl", json.dumps({"image": "images/000000.png", "objects": [{"id": "O0"}]}) + "\n", ":1: not a line of a drive"),
+        ("objects.json", "[]", "expected one of objects.json"),
+        ("scenes.jsonl", json.dumps({"image": "images/000000.png", "intrinsics": [9, 9, 9, 9], "objects": []}) + "\n",
+         "lengths differ"),
     ],
-)
+)  # fmt: skip
 def test_bad_truth_is_refused(drive: SimulatedDrive, tmp_path: Path, file: str, change: str, match: str) -> None:
-    for name in ("objects.json", "scenes.jsonl", "voxels.npz"):
-        shutil.copy(drive.folder / name, tmp_path / name)
-    (tmp_path / file).write_text(change)
+    folder = tmp_path / "drive"
+    shutil.copytree(drive.folder, folder)
+    (folder / file).write_text(change)
     with pytest.raises(InputError, match=match):
-        read_truth(tmp_path, names(drive))
+        read_truth(folder, names(drive))
+
+
+def test_images_and_shapes_must_be_those_of_the_drive(drive: SimulatedDrive, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not an image of the drive"):
+        read_truth(drive.folder, ["000000.png", "other.png"])
+    folder = tmp_path / "drive"
+    shutil.copytree(drive.folder, folder)
+    np.savez(folder / "voxels.npz", something=np.zeros(3, dtype=np.uint8))
+    with pytest.raises(InputError, match="a true shape is missing"):
+        read_truth(folder, names(drive))

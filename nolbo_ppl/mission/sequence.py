@@ -1,0 +1,180 @@
+"""What a run is made from: images, camera, odometry and truth of every image; which images are keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from nolbo_ppl.data.frames import FrameSequence, open_frames, read_intrinsics
+from nolbo_ppl.data.trajectories import match_times, read_trajectory
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.visual_odometry import (
+    GroundHeight,
+    KnownLengths,
+    Odometry,
+    Scale,
+    at_keyframes,
+    estimate_odometry,
+    keyframes,
+    lengths_of,
+)
+from nolbo_ppl.mission.config import RunConfig
+from nolbo_ppl.mission.summary import read_covariance
+
+Poses = Float[np.ndarray, "n 4 4"]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The input of a run."""
+
+    frames: FrameSequence
+    """All images."""
+    intrinsics: Float[np.ndarray, " 4"]
+    """[fx, fy, cx, cy], px."""
+    used: Int[np.ndarray, " u"]
+    """Images that are looked at: every so many-th."""
+    truth: Poses | None
+    """True pose of every image."""
+
+    def camera(self) -> dict[str, Any]:
+        """`intrinsics.json`."""
+        height, width = self.frames.frame(0).shape[:2]
+        return {**dict(zip(("fx", "fy", "cx", "cy"), self.intrinsics.tolist())), "width": width, "height": height}
+
+    def fingerprint(self) -> Any:
+        """What tells one sequence of images from another."""
+        return [len(self.frames), *(self.frames.name(k) for k in range(len(self.frames)))]
+
+
+@dataclass(frozen=True)
+class Every:
+    """Some frames of a sequence."""
+
+    frames: FrameSequence
+    """All."""
+    used: Int[np.ndarray, " u"]
+    """Which."""
+
+    def __len__(self) -> int:
+        return len(self.used)
+
+    def frame(self, k: int, /) -> UInt8[np.ndarray, "h w 3"]:
+        """One of them."""
+        return self.frames.frame(int(self.used[k]))
+
+
+@dataclass(frozen=True)
+class FoundOdometry:
+    """Odometry of the images that are looked at."""
+
+    odometry: Odometry
+    """Poses and, where they are known, covariances."""
+    stated: bool
+    """Whether covariances are known."""
+
+    def at(self, rows: Int[np.ndarray, " k"]) -> tuple[Poses, Float[np.ndarray, "k-1 6 6"] | None]:
+        """Poses at these rows and the covariances of the motions between them."""
+        chosen = at_keyframes(self.odometry, rows)
+        return chosen.T_world_camera, chosen.covariance if self.stated else None
+
+
+def poses_of_images(path: Path, count: int, times: Float[np.ndarray, " n"] | None) -> Poses:
+    """A pose for each image: rows in the order of the images, or TUM rows matched by time.
+
+    Raises:
+        InputError: neither fits.
+    """
+    found = read_trajectory(path)
+    if len(found) == count:
+        return found.T_world_camera
+    if found.times is None or times is None:
+        raise input_error("poses do not match the images", got=f"{len(found)} rows", expected=f"{count}, one an image", file=path)
+    rows, partner = match_times(times, found.times)
+    if len(rows) < count:
+        raise input_error("poses lack times of the images", got=f"{len(rows)} of {count} matched within 20 ms", file=path)
+    return found.T_world_camera[partner]
+
+
+def open_drive(config: RunConfig) -> Drive:
+    """Open images, camera and truth.
+
+    Raises:
+        InputError: one of them is missing or malformed, or the truth does not match the images.
+    """
+    frames = open_frames(config.images)
+    truth = None if config.truth is None else poses_of_images(config.truth, len(frames), frames.times)
+    return Drive(frames, read_intrinsics(config.intrinsics), np.arange(0, len(frames), config.every), truth)
+
+
+def scale_of(drive: Drive, config: RunConfig) -> Scale:
+    """Where visual odometry has its lengths from: a wheel, the height over the ground, or the truth.
+
+    Raises:
+        InputError: nowhere, or a wheel file that does not fit.
+    """
+    if config.camera_height is not None:
+        return GroundHeight(config.camera_height, pitch=config.camera_pitch)
+    if config.wheel is not None:
+        return KnownLengths(lengths_between(read_lengths(config.wheel, len(drive.frames) - 1), drive.used))
+    if drive.truth is not None:
+        return KnownLengths(lengths_of(drive.truth[drive.used]))
+    raise input_error("visual odometry without a scale", expected="--camera-height, --wheel or --truth",
+                      do="or give an odometry of your own with --odometry")  # fmt: skip
+
+
+def read_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
+    """Lengths of the steps between successive images, m, a number a line.
+
+    Raises:
+        InputError: not that many numbers; names the file.
+    """
+    if not path.is_file():
+        raise input_error("no such file", file=path)
+    try:
+        lengths = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+    except ValueError as error:
+        raise input_error("not a list of lengths", got=error, expected="a number a line, m", file=path) from None
+    if len(lengths) != count:
+        raise input_error("lengths of steps", got=f"{len(lengths)} numbers", expected=f"{count}, one between images", file=path)
+    return lengths
+
+
+def lengths_between(lengths: Float[np.ndarray, " n"], used: Int[np.ndarray, " u"]) -> Float[np.ndarray, " u-1"]:
+    """Way between the images that are looked at."""
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    return np.diff(along[used])
+
+
+def estimate_or_read(drive: Drive, config: RunConfig) -> FoundOdometry:
+    """The given odometry, with the covariances beside it where there are any, or visual odometry.
+
+    Raises:
+        InputError: an odometry that does not match the images, or none and no scale to make one.
+    """
+    if config.odometry is None:
+        found = estimate_odometry(
+            Every(drive.frames, drive.used), drive.intrinsics, scale_of(drive, config), config.visual, progress=True
+        )
+        return FoundOdometry(found, stated=True)
+    poses = poses_of_images(config.odometry, len(drive.frames), drive.frames.times)
+    covariance = read_covariance(config.odometry.parent / "odometry_covariance.npz")
+    stated = covariance is not None and len(covariance) == len(poses) - 1
+    n = len(poses) - 1
+    every = Odometry(
+        poses, covariance if covariance is not None and stated else np.zeros((n, 6, 6)), *np.zeros((2, n), dtype=np.int64),
+        np.zeros(n, dtype=np.uint8),
+    )  # fmt: skip
+    return FoundOdometry(at_keyframes(every, drive.used), stated)
+
+
+def keyframe_rows(found: FoundOdometry, config: RunConfig) -> Int[np.ndarray, " k"]:
+    """Rows of the odometry that are keyframes: all, or those far enough from the last."""
+    if config.keyframe_distance == 0 and config.keyframe_angle == 0:
+        return np.arange(len(found.odometry))
+    distance, angle = (value or np.inf for value in (config.keyframe_distance, config.keyframe_angle))
+    return keyframes(found.odometry, distance, angle)
