@@ -58,7 +58,9 @@ def em_slider(run: RunFolder) -> str:
     errors, described = iteration_errors(run), steps(run)
     data = []
     for i, (way, points) in enumerate(zip(every, spots)):
-        said = [f"iteration {i} of {len(iterations) - 1}" if i else "odometry, before the first iteration"]
+        said = [f"iteration {i} of {len(described) or len(iterations) - 1}" if i else "odometry, before the first iteration"]
+        if i == len(iterations) - 1 and i > len(described) > 0:
+            said = ["result: landmarks merged, detections associated anew, a last solve"]
         if 0 < i <= len(described):
             said += [
                 f"{name}: {say(described[i - 1][key])}"
@@ -108,7 +110,9 @@ def error_steps(errors: list[float]) -> str:
     numbers = "".join(
         text(float(axes.px(i)), y0 + 16, i, text_anchor="middle") for i in range(0, len(errors), max(1, len(errors) // 25))
     )
-    labels = text((x0 + x1) / 2, axes.height - 8, "iteration of EM (0: odometry)", text_anchor="middle", class_="label")
+    labels = text(
+        (x0 + x1) / 2, axes.height - 8, "iteration of EM (0: odometry, last: result)", text_anchor="middle", class_="label"
+    )
     labels += text(
         14, (y0 + y1) / 2, "ATE, m", text_anchor="middle", class_="label", transform=f"rotate(-90 14 {number((y0 + y1) / 2)})"
     )

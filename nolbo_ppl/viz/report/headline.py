@@ -57,9 +57,10 @@ def headline(run: RunFolder) -> str:
     if scores is not None:
         tiles.append(("Loop precision", say(scores["precision"], 3), f"of {say(scores['found'], 3)} pairs of detections"))
         tiles.append(("Loop recall", say(scores["recall"], 3), f"of {say(scores['true'], 3)} true pairs"))
+    sure = sum(x.existence is None or x.existence >= 0.5 for x in run.landmarks)
     truth = _find(run.summary, "map", "objects_detected")
     note = f"{len(run.categories)} categories" if truth is None else f"{truth:.0f} objects seen often enough"
-    tiles.append(("Landmarks", str(len(run.landmarks)), note))
+    tiles.append(("Landmarks", str(sure), note))
     length = path_length(run.estimate)
     tiles.append(("Keyframes", str(len(run)), f"{say(length, 3)} m of way"))
     if run.associations is not None:

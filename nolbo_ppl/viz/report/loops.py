@@ -27,9 +27,13 @@ class Loop:
     """Frame in which it was seen again."""
 
 
-def loop_gap(frames: int) -> int:
-    """The gap that makes a loop: 50 frames, or a quarter of a drive of less than 200."""
-    return min(LOOP_GAP, max(frames // 4, 2))
+def loop_gap(run: RunFolder) -> int:
+    """The gap that makes a loop: the run's own, else 50 keyframes, or a quarter of a drive of less than 200."""
+    configuration = run.run.get("configuration")
+    stated = configuration.get("loop_gap") if isinstance(configuration, dict) else None
+    if isinstance(stated, int) and not isinstance(stated, bool) and stated > 0:
+        return stated
+    return min(LOOP_GAP, max(len(run) // 4, 2))
 
 
 def find_loops(found: RunAssociations, gap: int) -> list[Loop]:
@@ -75,5 +79,5 @@ def loop_scores(run: RunFolder) -> dict[str, float | None] | None:
     label, found = object_labels(run), run.associations
     if label is None or found is None or found.frame is None:
         return None
-    score = association_pairs(found.frame, label, found.landmark_of, loop_gap(len(run)))
+    score = association_pairs(found.frame, label, found.landmark_of, loop_gap(run))
     return {"precision": score.precision, "recall": score.recall, "found": score.found_pairs, "true": score.true_pairs}

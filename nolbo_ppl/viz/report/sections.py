@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 import numpy as np
 
 from nolbo_ppl.viz.report.em import em_slider, iteration_table
@@ -14,6 +16,8 @@ from nolbo_ppl.viz.report.svg import element, escape
 from nolbo_ppl.viz.report.text import figures_tables, say, settings_table
 from nolbo_ppl.viz.style import MUTED, category_colour
 
+OPTIONS = ("images", "intrinsics", "odometry", "wheel", "truth", "truth_objects", "depth", "right", "model", "out")
+"""Options of a run that name its inputs and outputs."""
 SETTINGS = (
     ("Versions", "versions", True), ("Time by stage, s", "seconds", True), ("Noise", "noise", False),
     ("Configuration", "configuration", False),
@@ -87,7 +91,7 @@ def loop_closures(run: RunFolder) -> str:
     if run.associations.frame is None:
         missing = "The frames of the detections are not in this folder: give --observations to see the loops."
         return element("p", missing, class_="note")
-    gap = loop_gap(len(run))
+    gap = loop_gap(run)
     loops = find_loops(run.associations, gap)
     scores, said = loop_scores(run), ""
     if scores is not None:
@@ -140,19 +144,30 @@ def iterations(run: RunFolder) -> str:
 def figures(run: RunFolder) -> str:
     """Every number of the summaries."""
     parts = ""
-    for source, values in (("", run.summary), ("SLAM: ", run.slam_summary)):
+    for source, values in (("", run.summary), ("SLAM: " if run.summary else "", run.slam_summary)):
         for title, rows in figures_tables(values):
             parts += element("div", element("h3", escape(source + title)) + rows, class_="block")
     return element("div", parts, class_="blocks") if parts else ""
 
 
+def command_of(run: RunFolder) -> str:
+    """The command as the run states it, else its inputs and outputs as options; empty when nothing is known."""
+    command, options = run.run.get("command"), run.run.get("configuration")
+    if command:
+        return command if isinstance(command, str) else shlex.join(map(str, command))
+    if not isinstance(options, dict):
+        return ""
+    words = [
+        word for name in OPTIONS if isinstance(options.get(name), str) for word in (f"--{name.replace('_', '-')}", options[name])
+    ]
+    return shlex.join(["nolbo", "run", *words, *(["--online"] if options.get("online") is True else [])])
+
+
 def how(run: RunFolder) -> str:
     """Command, configuration, versions, stages."""
-    parts = ""
-    command = run.run.get("command")
+    parts, command = "", command_of(run)
     if command:
-        words = command if isinstance(command, str) else " ".join(map(str, command))
-        parts += element("pre", element("code", escape(words)))
+        parts += element("pre", element("code", escape(command)))
     if isinstance(run.run.get("complete"), list):
         parts += element("p", escape("Complete stages: " + ", ".join(map(str, run.run["complete"])) + "."))
     sources = (("run", run.run), ("SLAM", run.slam_summary))
@@ -165,8 +180,14 @@ def how(run: RunFolder) -> str:
 
 
 SECTIONS = (
-    ("trajectory", "Trajectory", trajectory), ("errors", "Error over time", errors), ("map", "Map", world_map),
-    ("loops", "Loop closures", loop_closures), ("association", "Association", association), ("landmarks", "Landmarks", landmarks),
-    ("em", "EM, iteration by iteration", iterations), ("figures", "Figures", figures), ("how", "How it was run", how),
+    ("trajectory", "Trajectory", trajectory),
+    ("errors", "Error over time", errors),
+    ("map", "Map", world_map),
+    ("loops", "Loop closures", loop_closures),
+    ("association", "Association", association),
+    ("landmarks", "Landmarks", landmarks),
+    ("em", "EM, iteration by iteration", iterations),
+    ("figures", "Figures", figures),
+    ("how", "How it was run", how),
 )
 """Anchor, title and maker of each section, in order."""

@@ -9,8 +9,26 @@ from typing import Any
 from nolbo_ppl.viz.report.svg import element, escape
 
 UNITS = {
-    "ate": "ATE, m", "ate_rmse": "ATE, m", "rpe_translation": "RPE translation, m", "rpe_rotation": "RPE rotation, rad",
-    "seconds": "seconds, s", "loop_precision": "loop precision", "loop_recall": "loop recall",
+    "ate": "ATE, m",
+    "ate_rmse": "ATE, m",
+    "rpe_translation": "RPE translation, m",
+    "rpe_rotation": "RPE rotation, rad",
+    "path_length": "path length, m",
+    "seconds": "time by stage, s",
+    "position_error": "position error by range, m",
+    "p90": "90th percentile",
+    "median_share": "median, share of the range",
+    "p90_share": "90th percentile, share of the range",
+    "coverage90": "truths inside 90 % regions",
+    "iou": "voxel IoU by number of views",
+    "median_position_error": "median position error, m",
+    "median_rotation_error_deg": "median rotation error, °",
+    "share_of_em": "share of EM in the time",
+    "gap_frames": "gap, keyframes",
+    "map": "map against the truth",
+    "loops": "loop pairs",
+    "shape": "shapes",
+    "observation_figures": "observations against the truth",
 }
 """Figures whose name alone would not say what they are."""
 SETTINGS = ("configuration", "versions", "iterations", "warnings", "noise", "fingerprints", "complete")
@@ -67,27 +85,26 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], class_: str = "") 
     return element("div", element("table", header + element("tbody", body), class_=class_ or None), class_="scroll")
 
 
-def figures_tables(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+def figures_tables(values: Mapping[str, Any], title: str = "Counts") -> list[tuple[str, str]]:
     """Figures of a summary: a titled table for each nested object, the plain ones first.
 
-    Objects whose members are objects with the same keys become one table with these keys as columns.
+    Objects whose members are objects become one table with the members as columns, and so do the errors before and after.
     """
-    plain = {k: v for k, v in values.items() if not isinstance(v, Mapping) and k not in SETTINGS and not isinstance(v, list)}
+    plain = {k: v for k, v in values.items() if not isinstance(v, (Mapping, list)) and k not in SETTINGS}
     out = []
     if plain:
-        out.append(("Counts", table(("", ""), [(escape(title_of(k)), escape(say(v))) for k, v in plain.items()])))
-    trajectories = {k: values[k] for k in ("before", "after", "oracle") if isinstance(values.get(k), Mapping)}
-    if len(trajectories) > 1:
-        out.append(("Trajectory", _columns(trajectories)))
+        out.append((title, table(("", ""), [(escape(title_of(k)), escape(say(v))) for k, v in plain.items()])))
+    errors = {k: values[k] for k in ("before", "after", "oracle") if isinstance(values.get(k), Mapping)}
+    if errors:
+        out.append(("Trajectory", _columns(errors)))
     for key, value in values.items():
-        if key in SETTINGS or not isinstance(value, Mapping) or (key in trajectories and len(trajectories) > 1) or not value:
+        if key in SETTINGS or key in errors or not isinstance(value, Mapping) or not value:
             continue
-        if all(isinstance(member, Mapping) for member in value.values()) and len(value) > 1:
-            out.append((title_of(key).capitalize(), _columns(value)))
+        name = title_of(key)[:1].upper() + title_of(key)[1:]
+        if len(value) > 1 and all(isinstance(member, Mapping) for member in value.values()):
+            out.append((name, _columns(value)))
         else:
-            rows = [(escape(", ".join(map(title_of, path))), escape(say(leaf))) for path, leaf in flatten(value, SETTINGS)]
-            if rows:
-                out.append((title_of(key).capitalize(), table(("", ""), rows)))
+            out += figures_tables(value, name)
     return out
 
 

@@ -15,7 +15,6 @@ from nolbo_ppl.data.simulate import R_WORLD_UPRIGHT, DetectorConfig, Drive, Worl
 from nolbo_ppl.data.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.geometry.pose import inverse, make_pose, so3_exp
 from nolbo_ppl.geometry.voxels import voxel_centres
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, init, step
 from nolbo_ppl.inference.slam.shapes import write_voxels
 from nolbo_ppl.io import read_json, write_json, write_jsonl
 from nolbo_ppl.slam import SlamArguments, run
@@ -75,19 +74,6 @@ def blob(extent: tuple[float, float, float], n: int = 16) -> np.ndarray:
     return 1 / (1 + np.exp(9 * (np.minimum(body, cabin) - 1)))
 
 
-def make_iterations(path: Path, count: int = 3) -> None:
-    """The first iterations of EM, as `iterations.npz`."""
-    made = drive()
-    state = init(SlamProblem(made.odometry, made.observations), SlamConfig())
-    poses, places = [made.odometry], [np.zeros((0, 3))]
-    for _ in range(count):
-        state, _ = step(state)
-        poses.append(state.estimate.T_world_camera)
-        places.append(state.estimate.T_world_landmark[:, :3, 3])
-    arrays = {f"landmarks_{i}": x.astype(np.float32) for i, x in enumerate(places)}
-    np.savez(path, T_world_camera=np.stack(poses).astype(np.float32), **arrays)
-
-
 def make_run(folder: Path) -> Path:
     """A complete run folder, as `nolbo run` leaves it."""
     make_slam(folder)
@@ -104,20 +90,24 @@ def make_run(folder: Path) -> Path:
         Image.fromarray(np.tile(pixels, (1, 80, 1)).astype(np.uint8)).save(folder / "crops" / f"{row['name']}.png")
     shapes = {row["name"]: blob((0.2, 0.4, 0.16 + 0.02 * (k % 3))) for k, row in enumerate(landmarks[:-1])}
     write_voxels(folder / "slam" / "landmarks_voxels.npz", {name: (mean, mean * (1 - mean) / 2) for name, mean in shapes.items()})
-    write_jsonl(folder / "frames.jsonl", [{"frame": t, "image": f"images/{t:06d}.png", "index": 3 * t, "time": 0.3 * t}
-                                          for t in range(FRAMES)])
+    write_jsonl(
+        folder / "frames.jsonl",
+        [{"frame": t, "image": f"images/{t:06d}.png", "index": 3 * t, "time": 0.3 * t} for t in range(FRAMES)],
+    )
     write_json(folder / "intrinsics.json", {"fx": 48.0, "fy": 48.0, "cx": 48.0, "cy": 24.0, "width": 96, "height": 48})
     names = [None if o < 0 else f"O{o}" for o in made.object_of]
     write_json(folder / "objects.json", {"objects": dict(zip(made.observations.id, names))})
-    make_iterations(folder / "slam" / "iterations.npz")
     slam = json.loads((folder / "slam" / "summary.json").read_text(encoding="utf-8"))
     write_json(folder / "run.json", {
-        "command": ["nolbo", "run", "--images", "<drive>"], "configuration": {"model": "tiny", "slam": {"samples": 64}},
+        "command": ["nolbo", "run", "--images", "<drive>"],
+        "configuration": {"model": "tiny", "loop_gap": 10, "slam": {"samples": 64}},
         "versions": {"nolbo-ppl": "0.1.0"}, "seconds": {"observe": 3.2, "slam": 1.1}, "complete": ["observe", "slam"],
     })  # fmt: skip
     write_json(folder / "summary.json", {
         "frames": FRAMES, "before": slam["before"], "after": slam["after"], "oracle": {"ate": 0.9 * slam["after"]["ate"]},
-        "observations": {"recall": 0.91, "position": {"all": {"median": 0.2, "p90": 0.5}, "0-5 m": {"median": 0.1, "p90": 0.2}}},
+        "observation_figures": {
+            "recall": 0.91, "position_error": {"all": {"median": 0.2, "p90": 0.5}, "0-5 m": {"median": 0.1}},
+        },
         "images_per_second": 12.5, "warnings": [],
     })  # fmt: skip
     return folder
