@@ -30,12 +30,12 @@ import torch
 from scipy.stats import chi2
 from sklearn.manifold import TSNE
 from sklearn.metrics import silhouette_score
+from torch import nn
 
 import nolbo_ppl
 from nolbo_ppl.data.pool import ShapePool
 from nolbo_ppl.data.scene_config import preset
 from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.models.nolbo import Nolbo
 from nolbo_ppl.models.scene import unpack_bits
 from nolbo_ppl.viz.shape import draw_shape
 from nolbo_ppl.viz.style import category_colour
@@ -46,7 +46,7 @@ categories, dimensions = model.config.categories, model.config.latent_dim
 # %% [markdown]
 # ## What the guide sees
 #
-# Three hundred images of one unseen object each. The guide answers for the object's box; its latent's mean is one point.
+# Some 280 images of one unseen object each. The guide answers for the object's box; its latent's mean is one point.
 
 # %%
 single = dataclasses.replace(
@@ -54,7 +54,7 @@ single = dataclasses.replace(
     truncation_probability=0.0,
 )
 source = SceneSource(single, seed=88_003)
-scenes = [scene for scene in map(source.render, range(320)) if len(scene.labels) == 1]
+scenes = [scene for scene in map(source.render, range(280)) if len(scene.labels) == 1]
 labels = np.array([categories.index(scene.labels[0].category) for scene in scenes])
 answers = model.observe_boxes(
     [scene.image for scene in scenes], np.array([scene.intrinsics for scene in scenes]),
@@ -71,34 +71,44 @@ for axis, scene in zip(axes, scenes):
 # %% [markdown]
 # ## A plain autoencoder
 #
-# For comparison, the same 3D encoder and decoder as the library's shape autoencoder, trained on reconstruction alone: no
-# prior, no labels, no noise. It is given an advantage: it sees the true voxels, at training and below, where the guide has
-# an image.
+# For comparison: a 3D autoencoder with a latent of the same size, trained on reconstruction alone, without prior, labels or
+# noise. It is given an advantage: it sees the true voxels (at 16³), at training and below, where the guide has an image.
 
 # %%
 pool = ShapePool(categories, seed=88_004)
-items = [pool.item(category, number) for category in categories for number in range(40)]
-voxels = unpack_bits(torch.from_numpy(np.stack([item.voxels for item in items])), model.config.voxel_size).float()
+items = [pool.item(category, number) for category in categories for number in range(24)]
 
-networks = Nolbo.from_seed(model.config, 0).float()
-encoder, decoder = networks.shape_guide.encoder.train(), networks.story.decoder.train()
-optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], lr=2e-3)
-generator, loss_at = torch.Generator().manual_seed(0), []
-for _ in range(240):
-    batch = voxels[torch.randint(len(voxels), (32,), generator=generator)]
-    logits = decoder(encoder(batch)[0])
-    loss = torch.nn.functional.binary_cross_entropy_with_logits(logits, batch)
+
+def coarse(items):
+    """Occupancy of shapes at 16^3."""
+    packed = torch.from_numpy(np.stack([item.voxels for item in items]))
+    fine = unpack_bits(packed, model.config.voxel_size).float()
+    return torch.nn.functional.adaptive_avg_pool3d(fine[:, None], 16).gt(0.4).float()
+
+
+torch.manual_seed(0)
+encoder = nn.Sequential(
+    nn.Conv3d(1, 16, 4, 2, 1), nn.ELU(), nn.Conv3d(16, 32, 4, 2, 1), nn.ELU(), nn.Flatten(), nn.Linear(32 * 64, dimensions)
+)
+decoder = nn.Sequential(
+    nn.Linear(dimensions, 32 * 64), nn.ELU(), nn.Unflatten(1, (32, 4, 4, 4)), nn.ConvTranspose3d(32, 16, 4, 2, 1), nn.ELU(),
+    nn.ConvTranspose3d(16, 1, 4, 2, 1),
+)
+voxels, loss_at = coarse(items), []
+optimiser = torch.optim.Adam([*encoder.parameters(), *decoder.parameters()], lr=3e-3)
+for _ in range(200):
+    batch = voxels[torch.randint(len(voxels), (32,))]
+    loss = nn.functional.binary_cross_entropy_with_logits(decoder(encoder(batch)), batch)
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-    loss_at.append(float(loss))
-encoder.eval(), decoder.eval()
+    loss_at.append(loss.item())
 
-truth = unpack_bits(torch.from_numpy(np.stack([scene.labels[0].item.voxels for scene in scenes])), model.config.voxel_size)
+known = coarse([scene.labels[0].item for scene in scenes])
 with torch.inference_mode():
-    plain = encoder(truth.float())[0]
-    found = decoder(plain) > 0
-plain, known = plain.numpy(), truth.bool()
+    plain = encoder(known)
+    found, known = decoder(plain) > 0, known.bool()
+plain = plain.numpy()
 iou = ((found & known).flatten(1).sum(1) / (found | known).flatten(1).sum(1)).mean()
 figure, axis = plt.subplots(figsize=(6, 2.2), layout="constrained")
 axis.semilogy(loss_at, color="#4e79a7")
@@ -189,7 +199,7 @@ samples = means[chosen] + rng.standard_normal((len(chosen), dimensions))
 occupancy = model.decode(samples)
 with torch.inference_mode():
     latents = rng.multivariate_normal(plain.mean(0), np.cov(plain.T), len(chosen))
-    anything = torch.sigmoid(decoder(torch.as_tensor(latents, dtype=torch.float32))).numpy()
+    anything = torch.sigmoid(decoder(torch.as_tensor(latents, dtype=torch.float32)))[:, 0].numpy()
 figure = plt.figure(figsize=(12, 4.4))
 grid = figure.add_gridspec(2, len(chosen), left=0, right=1, top=0.92, bottom=0, hspace=0.12)
 viewpoint = np.array([0.6, 0.35, 0.0])

@@ -122,7 +122,8 @@ def test_links_between_documents_lead_somewhere() -> None:
     for page in PAGES:
         text = FENCE.sub("", page.read_text(encoding="utf-8"))
         for target in re.findall(r"\]\(([^)\s]+)\)", text):
-            if "://" not in target and not target.startswith("#"):
+            made = target.startswith("reference/")  # pages that the build makes
+            if "://" not in target and not target.startswith("#") and not made:
                 assert (page.parent / target.split("#")[0]).exists(), f"{page.name}: {target}"
 
 
