@@ -133,16 +133,20 @@ def test_a_run_can_start_from_trained_weights(
         config_of(folders, tmp_path / "other", initial=start, latent_dim=8).model()
 
 
-def test_mixed_difficulties_are_half_and_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first half of the generated scenes is `standard`, the second `full`; held-out scenes as well."""
+def test_mixed_difficulties_are_thirds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third of the generated scenes is `standard`, one `full`, one from worlds; held-out scenes as well."""
     monkeypatch.setattr(cache, "BLOCK", 4)
-    config = TrainConfig(tmp_path / "run", preset="nano", difficulty="mixed", count=8, evaluate_scenes=4, cache=tmp_path,
+    config = TrainConfig(tmp_path / "run", preset="nano", difficulty="mixed", count=12, evaluate_scenes=4, cache=tmp_path,
                          single_steps=0, workers=1)
     monkeypatch.setattr(training, "LEAST_HELD_OUT", 4)
     data = training.TrainingData(config, 0, 1)
-    assert len(data.train) == 8
-    sources = {read_json(path)["config"]["objects"][1] for path in (tmp_path / "scenes").glob("*/source.json")}
-    assert sources == {preset("standard").objects[1], preset("full").objects[1]}
+    assert len(data.train) == 12
+    sources = [read_json(path) for path in (tmp_path / "scenes").glob("*/source.json")]
+    assert len(sources) == 6
+    assert {one["config"]["objects"][1] for one in sources if "config" in one} == {4, 6}
+    assert {one["seed"] for one in sources if "views" in one} == {0, training.VALIDATION_SEED}
+    from_worlds = data.train.batch(np.arange(8, 12))
+    assert (from_worlds["instance"][from_worlds["present"]] >= 1_000_000).all()
     first = data.train.batch(np.arange(4))["image"]
     np.testing.assert_array_equal(first[0], SceneSource(preset("standard", 64), 0).render(0).image.transpose(2, 0, 1))
 

@@ -13,6 +13,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -21,7 +22,7 @@ from tqdm import tqdm
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
 from nolbo_ppl.data.pool import BLOCK, VOXELS
-from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.data.scene import Rendered
 from nolbo_ppl.data.workers import parallel
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io import write_json
@@ -30,13 +31,35 @@ VERSION = 2
 """Raised when the same seed gives other scenes than before, so that old caches are not taken for new ones."""
 
 
-def cache_key(source: SceneSource, slots: int = SLOTS) -> str:
+class Source(Protocol):
+    """An endless, numbered sequence of scenes (`SceneSource`, `nolbo_ppl.data.drive.views.ViewSource`)."""
+
+    @property
+    def config(self) -> Sized:
+        """What the scenes look like."""
+
+    def render(self, index: int) -> Rendered:
+        """Image and labels of the scene of that number."""
+
+    def describe(self) -> dict[str, object]:
+        """All that the scenes depend on."""
+
+
+class Sized(Protocol):
+    """Images of one size."""
+
+    @property
+    def size(self) -> int:
+        """Height and width, px."""
+
+
+def cache_key(source: Source, slots: int = SLOTS) -> str:
     """Sixteen hexadecimal digits that identify the scenes of a source."""
     text = json.dumps({"version": VERSION, "slots": slots, **source.describe()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _write_shard(source: SceneSource, folder: Path, shard: int, slots: int) -> int:
+def _write_shard(source: Source, folder: Path, shard: int, slots: int) -> int:
     """Render one shard of `BLOCK` scenes into `folder/shard-00000`."""
     temporary = folder / f".shard-{shard:05d}.{os.getpid()}.tmp"
     shutil.rmtree(temporary, ignore_errors=True)
@@ -67,7 +90,7 @@ def _write_shard(source: SceneSource, folder: Path, shard: int, slots: int) -> i
 
 
 def write_cache(
-    cache: str | os.PathLike[str], source: SceneSource, count: int, workers: int = 1, slots: int = SLOTS
+    cache: str | os.PathLike[str], source: Source, count: int, workers: int = 1, slots: int = SLOTS
 ) -> CachedScenes:
     """Render what is missing of the first `count` scenes (whole shards of 1024) into a cache and open it.
 

@@ -12,6 +12,7 @@ import torch.distributed as distributed
 
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.cache import CachedScenes, write_cache
+from nolbo_ppl.data.drive.views import ViewConfig, ViewSource
 from nolbo_ppl.data.folder import SceneFolder
 from nolbo_ppl.data.loader import Scenes, prefetch
 from nolbo_ppl.data.scene_config import SceneConfig
@@ -44,7 +45,8 @@ class TrainingData:
         if config.scenes is not None:
             self._open_folders(config.scenes, size)
         else:
-            kinds = ("standard", "full") if config.difficulty == "mixed" else (config.difficulty,)
+            mixed = config.difficulty == "mixed"
+            kinds = ("standard", "full") if mixed else (config.difficulty,)
             bases = [scene_preset(kind, size) for kind in kinds]
             photographs = None if config.backgrounds is None else str(config.backgrounds)
             root = config.cache.expanduser() / "scenes"
@@ -52,19 +54,22 @@ class TrainingData:
                 distributed.barrier()  # the first process renders what is missing
             single = dataclasses.replace(bases[0], objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
 
-            def cached(of: SceneConfig, seed: int, count: int) -> CachedScenes:
-                behind = None if of is bases[0] and len(bases) > 1 else photographs
-                return write_cache(root, SceneSource(of, seed, backgrounds=behind), count, config.workers)
+            def source(of: SceneConfig, seed: int) -> SceneSource:
+                return SceneSource(of, seed, backgrounds=None if mixed and of is bases[0] else photographs)
+
+            def cached(of: SceneSource | ViewSource, count: int) -> CachedScenes:
+                return write_cache(root, of, count, config.workers)
 
             def all_of(seed: int, count: int) -> Joined:
-                return Joined([cached(base, seed, -(-count // len(bases))) for base in bases])
+                sources = [source(base, seed) for base in bases] + ([ViewSource(ViewConfig(size), seed)] if mixed else [])
+                return Joined([cached(one, -(-count // len(sources))) for one in sources])
 
             train = all_of(config.seed, config.count)
             held_out_scenes = all_of(config.seed + VALIDATION_SEED, max(LEAST_HELD_OUT, config.evaluate_scenes))
             self.train, self._held_out = train, held_out_scenes
             self.single = self.train
             if config.single_steps:
-                self.single = cached(single, config.seed, config.single_count)
+                self.single = cached(source(single, config.seed), config.single_count)
             if world > 1 and rank == 0:
                 distributed.barrier()
             self.table, self._held_out_table = ShapeTable(*train.shapes()), ShapeTable(*held_out_scenes.shapes())

@@ -48,7 +48,8 @@ class TrainConfig:
     single_count: int = 1024
     """Number of generated scenes with one object, for the second stage."""
     difficulty: Literal["easy", "standard", "full", "mixed"] = "standard"
-    """Difficulty of the generated scenes; `mixed` is half standard, half full."""
+    """Difficulty of the generated scenes; `mixed` is a third standard, a third full, and a third views of worlds to drive
+    through (`nolbo_ppl.data.drive`)."""
     backgrounds: Path | None = None
     """Folder of photographs behind the generated scenes (with `mixed`, behind the full ones)."""
     initial: str | None = None

@@ -214,10 +214,10 @@ def camera_poses(
     heading = heading + np.radians(wobble.heading) * _wave(s, (slow, middle), rng)
     tilts = np.radians(tilt + wobble.tilt * _wave(s, (middle, quick), rng))
     rolls = np.radians(wobble.roll * _wave(s, (middle, quick), rng))
-    return np.stack([_pose(*row) for row in zip(xy[:, 0], xy[:, 1], z, heading, tilts, rolls)])
+    return np.stack([camera_pose(*row) for row in zip(xy[:, 0], xy[:, 1], z, heading, tilts, rolls)])
 
 
-def _pose(x: float, y: float, z: float, heading: float, tilt: float, roll: float) -> Float[np.ndarray, "4 4"]:
+def camera_pose(x: float, y: float, z: float, heading: float, tilt: float, roll: float) -> Float[np.ndarray, "4 4"]:
     """`T_ground_camera`: level, then tilted down, then rolled; angles in rad."""
     ch, sh, ct, st, cr, sr = (f(a) for a in (heading, tilt, roll) for f in (np.cos, np.sin))
     level = np.array([[sh, 0, ch], [-ch, 0, sh], [0, -1, 0]])
