@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import zlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels, voxel_centres
 from nolbo_ppl.inference.measure import SceneTruth, measure_detections, measure_objects
 from nolbo_ppl.inference.observations import Observations, ViewpointModes
+from nolbo_ppl.metrics.detection import match
 from nolbo_ppl.metrics.figures import REQUIRED, confusion, flipped
 from nolbo_ppl.models.config import tiny
 from nolbo_ppl.viz.examples import badness
@@ -58,7 +60,8 @@ def made_scenes(count, seed=0, objects=4):
             SceneTruth(
                 image=rng.integers(0, 256, (64, 64, 3), dtype=np.uint8), intrinsics=CAMERA, box=box, category=category,
                 R_camera_object=egocentric(viewpoint, position), position=position, symmetry=SYMMETRY[category],
-                visibility=np.ones(objects), voxels=pack_voxels(ellipsoids(rng, objects)),
+                visibility=np.ones(objects), voxels=pack_voxels(ellipsoids(rng, objects)), diagonal=np.ones(objects),
+                ignore=np.zeros((0, 4)),
             )
         )  # fmt: skip
     return scenes, viewpoints
@@ -277,6 +280,96 @@ def test_small_and_hidden_objects_do_not_count():
     # Everything is found, what does not count included, and none of that is held against the model.
     assert result.figures["ap50"] == evaluate.Estimate(1.0, 1.0, 1.0, 20)
     assert result.detections.all.ignored.sum() == 20
+
+
+def test_the_true_size_corrects_the_depth():
+    """Everything is seen twice as far and 1.6 times as large: the known size leaves a quarter of the distance too much."""
+    scenes, viewpoints = made_scenes(10)
+
+    def change(said, scene, k):
+        return dataclasses.replace(said, position=2 * said.position, diagonal=1.6 * said.diagonal)
+
+    result = measure(config(), exact_oracle(scenes, viewpoints, change), scenes)
+    assert result.figures["median_depth_error"].value == pytest.approx(1.0)
+    assert result.figures["median_depth_error_known_size"].value == pytest.approx(0.25)
+    unknown = [dataclasses.replace(scene, diagonal=np.full(4, np.nan)) for scene in scenes]
+    result = measure(config(), exact_oracle(scenes, viewpoints, change), unknown)
+    assert result.figures["median_depth_error_known_size"].count == 0
+    assert result.figures["median_depth_error_known_size"].value is None
+
+
+def test_azimuth_alone():
+    """A tilt of 40 degrees spoils the viewpoint and leaves the azimuth right."""
+    scenes, viewpoints = made_scenes(10)
+
+    def change(said, scene, k):
+        tilted = said.viewpoint + np.array([0, math.radians(40), 0])
+        return dataclasses.replace(said, viewpoint=tilted, R_camera_object=egocentric(tilted, scene.position))
+
+    result = measure(config(), exact_oracle(scenes, viewpoints, change), scenes)
+    assert result.figures["acc_pi6"].value == 0.0 and result.figures["azimuth_acc_pi6"].value == 1.0
+
+
+def test_detections_in_regions_to_ignore_are_not_judged():
+    """A false detection halves the precision, unless the picture is unlabelled there."""
+    scenes, viewpoints = made_scenes(10)
+
+    model = exact_oracle(scenes, viewpoints)
+    right = model.observe
+
+    def observe(images, intrinsics, **options):
+        found = [one[[0, 1, 2, 3, 0, 1, 2, 3]] for one in right(images, intrinsics, **options)]
+        for one in found:
+            one.box[4:] += np.array([0, 200.0, 0, 200.0])
+        return found
+
+    model.observe = observe
+    plain = measure(config(), model, scenes).figures["ap50"].value
+    assert plain == pytest.approx(0.5, abs=0.01)
+    region = np.array([[0.0, 230.0, 200.0, 400.0]])
+    masked = [dataclasses.replace(scene, ignore=region) for scene in scenes]
+    result = measure(config(), model, masked)
+    assert result.figures["ap50"].value == 1.0 and result.detections.all.ignored.sum() == 40
+    assert result.figures["map50"].value == 1.0
+
+
+@pytest.mark.parametrize("share", [0.49, 0.51])
+def test_a_region_takes_what_lies_half_in_it(share):
+    box = np.array([[0.0, 0, 100, 50]])
+    region = np.array([[100 * (1 - share), -20, 500, 300.0]])
+    found = match([box], [np.ones(1)], [np.zeros((0, 4))], [np.zeros(0, dtype=bool)], regions=[region])
+    assert found.ignored.tolist() == [share > 0.5]
+
+
+def test_retrieval_takes_the_latents_at_the_true_boxes():
+    """An oracle that answers with the shape's own latent finds every instance; one that answers with nothing, none."""
+    from nolbo_ppl.data.instance_views import InstanceViews
+    from nolbo_ppl.data.scene_config import preset
+    from nolbo_ppl.data.source import SceneSource
+
+    views = InstanceViews(SceneSource(dataclasses.replace(preset("easy", 64), categories=("car", "chair"))), 3, CATEGORIES)
+    truth = {view.image.tobytes(): view.voxels for instance in views.instances for view in views.pair(*instance)}
+    model = Oracle([], [])
+
+    def own(image):  # a latent of its own for each shape
+        return np.random.default_rng(zlib.crc32(truth[image.tobytes()].tobytes())).normal(size=16)
+
+    def answers(latent):
+        def observe_boxes(images, intrinsics, boxes, *, decode, batch):
+            assert len(images) == len(intrinsics) == len(boxes) and all(len(box) == 1 for box in boxes) and not decode
+            return [SimpleNamespace(latent=latent(image)[None], latent_scale=np.full((1, 16), 0.1)) for image in images]
+
+        return observe_boxes
+
+    model.observe_boxes = answers(own)
+    found = evaluate.measure_retrieval(config(batch=4), model, views)
+    assert len(found) == 6 and (found.gallery == 3).all() and all((rank == 1).all() for rank in found.rank.values())
+    model.observe_boxes = answers(lambda image: np.zeros(16))
+    found = evaluate.measure_retrieval(config(batch=4), model, views)
+    assert all((rank == 3).all() for rank in found.rank.values())
+    lone = InstanceViews(views.source, 1, ("boat",))
+    with pytest.raises(InputError, match="instances to find again"):
+        evaluate.measure_retrieval(config(), model, lone)
 
 
 def test_missing_labels_are_left_out():
