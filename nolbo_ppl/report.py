@@ -9,7 +9,6 @@ from pathlib import Path
 
 import tyro
 
-from nolbo_ppl.errors import NolboError
 from nolbo_ppl.viz.report import write_report
 
 
@@ -45,12 +44,7 @@ def run(arguments: ReportArguments) -> Path:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line of `nolbo report`."""
-    arguments = tyro.cli(ReportArguments, prog="nolbo report", args=args)
-    try:
-        path = run(arguments)
-    except NolboError as error:
-        sys.stderr.write(f"error: {error}\n")
-        raise SystemExit(2) from None
+    path = run(tyro.cli(ReportArguments, prog="nolbo report", args=args))
     sys.stdout.write(f"{path}\n")
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import tyro
 
-from nolbo_ppl.errors import NolboError
 from nolbo_ppl.viz.report.folder import read_run
 from nolbo_ppl.viz.report.viewer import build_viewer, viser_module
 
@@ -60,9 +59,6 @@ def main(args: Sequence[str] | None = None) -> None:
     arguments = tyro.cli(ViewArguments, prog="nolbo view", args=args)
     try:
         run(arguments)
-    except NolboError as error:
-        sys.stderr.write(f"error: {error}\n")
-        raise SystemExit(2) from None
     except KeyboardInterrupt:
         sys.stdout.write("\n")
 
