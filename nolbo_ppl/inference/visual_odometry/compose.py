@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -44,7 +45,7 @@ def between(odometry: Odometry, rows: Int[np.ndarray, " m"]) -> Float[np.ndarray
     T = odometry.T_world_camera
     steps = relative(T[:-1], T[1:])
     result = np.zeros((max(len(rows) - 1, 0), 6, 6))
-    for i, (start, end) in enumerate(zip(rows[:-1], rows[1:])):
+    for i, (start, end) in enumerate(pairwise(rows)):
         total = odometry.covariance[start]
         for k in range(start + 1, end):
             total = compose_covariance(total, steps[k], odometry.covariance[k])
@@ -66,7 +67,7 @@ def keyframes(odometry: Odometry, distance: float, angle: float) -> Int[np.ndarr
     rows = [0]
     for k in range(1, len(T)):
         motion = relative(T[rows[-1]], T[k])
-        way = max(np.linalg.norm(motion[:3, 3]) / distance, float(rotation_angle(motion[:3, :3])) / angle)
+        way = max(float(np.linalg.norm(motion[:3, 3]) / distance), float(rotation_angle(motion[:3, :3])) / angle)
         if way >= (2.0 if odometry.flags[k - 1] else 1.0):
             rows.append(k)
     return np.array(rows, dtype=np.int64)
@@ -81,7 +82,7 @@ def at_keyframes(odometry: Odometry, rows: Int[np.ndarray, " m"]) -> Odometry:
         InputError: rows that are not there or do not increase.
     """
     covariance = between(odometry, rows)
-    pieces = [slice(start, end) for start, end in zip(rows[:-1], rows[1:])]
+    pieces = [slice(start, end) for start, end in pairwise(rows)]
     return replace(
         odometry,
         T_world_camera=odometry.T_world_camera[rows],

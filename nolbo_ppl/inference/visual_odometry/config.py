@@ -33,7 +33,7 @@ class OdometryConfig:
 
     detector: Literal["orb", "sift"] = "orb"
     """Features: ORB is faster, SIFT more accurate (docs: `nolbo odometry`)."""
-    features: int = 1200
+    features: int = 700
     """Features an image, at most."""
     fast_threshold: int = 5
     """Least contrast of an ORB corner in grey values; small, since small images of plain surfaces have few corners."""
@@ -47,6 +47,8 @@ class OdometryConfig:
     """Ratio test: a match is this much nearer than the second best (Lowe 2004)."""
     largest_shift: float = 0.25
     """Matches further apart than this part of the image's diagonal are dropped."""
+    patch: int = 11
+    """Side of the patches that are registered to place matches below a pixel; 0 takes the corners as they are."""
     threshold: float = 1.0
     """Inlier threshold of the essential matrix, px."""
     confidence: float = 0.999

@@ -48,12 +48,21 @@ def rays(pixels: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"]) 
     return np.column_stack([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones(len(pixels))])
 
 
+def cross(a: Float[np.ndarray, "... 3"], b: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+    """Cross products of rows; `np.cross` spends five times as long on its bookkeeping."""
+    result = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    result[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    result[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    result[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return result
+
+
 def tangent(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 2"]:
     """Two orthonormal vectors across a unit vector."""
     axis = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    first = np.cross(direction, axis)
+    first = cross(direction, axis)
     first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(direction, first)])
+    return np.column_stack([first, cross(direction, first)])
 
 
 def sampson(
@@ -70,8 +79,8 @@ def sampson(
     error = np.sum(first * line_first, axis=1)
     gradient = np.concatenate([line_first[:, :2], line_second[:, :2]], axis=1) / np.tile(intrinsics[:2], 2)
     norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
-    by_rotation = np.cross(second, line_second)  # d(x1' [t]x R [w]x x2) = w . (x2 x E'x1)
-    by_direction = np.cross(second @ R.T, first) @ tangent(direction)  # x1' [t]x R x2 = t . (R x2 x x1)
+    by_rotation = cross(second, line_second)  # d(x1' [t]x R [w]x x2) = w . (x2 x E'x1)
+    by_direction = cross(second @ R.T, first) @ tangent(direction)  # x1' [t]x R x2 = t . (R x2 x x1)
     return error / norm, np.concatenate([by_rotation, by_direction], axis=1) / norm[:, None]
 
 
@@ -84,9 +93,9 @@ def depths(
     The equation crossed with R x2 (and with x1), in least squares; negative behind the camera, zero at infinity.
     """
     turned = second @ R.T
-    normal = np.cross(turned, first)
-    by_first = np.cross(turned, translation)  # rho1 (R x2 x t) = R x2 x x1
-    by_second = np.cross(first, translation)  # rho2 (x1 x t) = R x2 x x1
+    normal = cross(turned, first)
+    by_first = cross(turned, translation)  # rho1 (R x2 x t) = R x2 x x1
+    by_second = cross(first, translation)  # rho2 (x1 x t) = R x2 x x1
     rho_first = np.sum(normal * by_first, axis=1) / np.maximum(np.sum(by_first**2, axis=1), 1e-18)
     rho_second = np.sum(normal * by_second, axis=1) / np.maximum(np.sum(by_second**2, axis=1), 1e-18)
     return np.column_stack([rho_first, rho_second])
@@ -128,7 +137,7 @@ def refine(
         direction = direction / np.linalg.norm(direction)
         limit = min(threshold * 2.0, max(GATE * scale, 0.1 * threshold))
         residual, jacobian = sampson(R, direction, first, second, intrinsics)
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < 1e-5:
             break
     inside = np.abs(residual) < limit
     scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE) if inside.any() else threshold

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.inference.visual_odometry.config import GroundHeight
-from nolbo_ppl.inference.visual_odometry.epipolar import TwoView, depths, student_weights
+from nolbo_ppl.inference.visual_odometry.epipolar import TwoView, cross, depths, student_weights
 
 BELOW_HORIZON = 0.06
 """Points on the ground lie at least this slope below the horizon."""
@@ -77,7 +77,7 @@ def fit_ground(
         return None
     slopes, rho = slopes[below], rho[below]
     # An error of one corner across the focal length shifts rho by its inverse lever |R x2 x t|.
-    lever = np.linalg.norm(np.cross(second[below] @ view.R.T, view.direction), axis=1)
+    lever = np.linalg.norm(cross(second[below] @ view.R.T, view.direction), axis=1)
     noise = np.sqrt(2.0) * view.scale / np.sqrt(intrinsics[0] * intrinsics[1]) / np.maximum(lever, 1e-6)
     plane = np.array([vote(rho / slopes[:, 0], noise / slopes[:, 0]), 0.0, 0.0])
     width = noise + COARSE * rho

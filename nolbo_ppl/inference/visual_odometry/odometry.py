@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import chain, make_pose
 from nolbo_ppl.inference.visual_odometry.config import GroundHeight, KnownLengths, OdometryConfig, Scale, StepFlag
 from nolbo_ppl.inference.visual_odometry.epipolar import TwoView, rays, tangent, two_view
-from nolbo_ppl.inference.visual_odometry.features import Features, detect, match
+from nolbo_ppl.inference.visual_odometry.features import Features, detect, grey, match, track
 from nolbo_ppl.inference.visual_odometry.ground import LengthBelief, fit_ground, next_length
 from nolbo_ppl.inference.visual_odometry.rotation import parallax_share, rotation_only
 
@@ -20,6 +21,8 @@ ROTATION_FLOOR, TRANSLATION_FLOOR = 1e-5, 1e-4
 """Least standard deviations of a step, rad and m: a covariance is never singular."""
 FIRST_LENGTH = 0.1
 """Scale of the translation of a step that cannot be measured when no step before it was, m."""
+LARGEST_CORRECTION = 3.0
+"""A match that its patch moves further is dropped, px."""
 FORWARD = np.array([0.0, 0.0, 1.0])
 
 
@@ -41,7 +44,7 @@ class VisualOdometry:
     """fx, fy, cx, cy, px."""
     scale: Scale
     """Where lengths come from."""
-    config: OdometryConfig = OdometryConfig()
+    config: OdometryConfig = field(default_factory=OdometryConfig)
     """Settings."""
 
     def __post_init__(self) -> None:
@@ -59,10 +62,10 @@ class OdometryState:
     """Number of frames seen before this one."""
     T_world_camera: Float[np.ndarray, "4 4"]
     """Pose of this frame; the world is the first camera."""
+    image: UInt8[np.ndarray, "h w"]
+    """This frame in grey."""
     features: Features
-    """Corners of this frame."""
-    shape: tuple[int, int]
-    """Height and width of the images."""
+    """Its corners."""
     step: Float[np.ndarray, "4 4"] | None = None
     """The step before, T_earlier_later."""
     direction: Float[np.ndarray, " 3"] | None = None
@@ -110,7 +113,8 @@ class Odometry:
 
 def init(setup: VisualOdometry, image: UInt8[np.ndarray, "h w 3"]) -> OdometryState:
     """State at the first frame. Raises `InputError` for anything but an RGB image."""
-    return OdometryState(0, np.eye(4), detect(image, setup.config), image.shape[:2])
+    picture = grey(image)
+    return OdometryState(0, np.eye(4), picture, detect(picture, setup.config))
 
 
 def step_covariance(
@@ -226,20 +230,25 @@ def step(
     Raises:
         InputError: an image of another size, or more frames than known lengths.
     """
-    if image.shape[:2] != state.shape:
-        raise input_error(f"frame {state.frame + 1} has another size", got=f"{image.shape[1]} x {image.shape[0]} px",
-                          expected=f"{state.shape[1]} x {state.shape[0]} px")
-    features = detect(image, setup.config)
-    largest = setup.config.largest_shift * float(np.hypot(*state.shape))
-    rows = match(state.features, features, setup.config.ratio, largest)
-    taken, length = motion(setup, state, state.features.pixels[rows[:, 0]], features.pixels[rows[:, 1]])
+    picture = grey(image)
+    height, width = state.image.shape
+    if picture.shape != state.image.shape:
+        raise input_error(f"frame {state.frame + 1} has another size", got=f"{picture.shape[1]} x {picture.shape[0]} px",
+                          expected=f"{width} x {height} px")
+    features = detect(picture, setup.config)
+    rows = match(state.features, features, setup.config.ratio, setup.config.largest_shift * float(np.hypot(height, width)))
+    first, second = state.features.pixels[rows[:, 0]], features.pixels[rows[:, 1]]
+    if setup.config.patch:
+        second, good = track(state.image, picture, first, second, setup.config.patch, LARGEST_CORRECTION)
+        first, second = first[good], second[good]
+    taken, length = motion(setup, state, first, second)
     measured = not taken.flags & (StepFlag.FEW_MATCHES | StepFlag.STILL | StepFlag.ROTATION)
     translation = taken.T_earlier_later[:3, 3]
     direction = state.direction
     if measured and np.linalg.norm(translation) > 0:
         direction = translation / np.linalg.norm(translation)
     pose = chain(state.T_world_camera, taken.T_earlier_later[None])[1]
-    after = OdometryState(state.frame + 1, pose, features, state.shape, taken.T_earlier_later, direction, measured, length)
+    after = OdometryState(state.frame + 1, pose, picture, features, taken.T_earlier_later, direction, measured, length)
     return after, taken
 
 
@@ -267,12 +276,12 @@ def estimate_odometry(
                           expected=f"{len(frames) - 1} for {len(frames)} frames")
     state = init(setup, frames.frame(0))
     steps: list[Step] = []
-    numbers: range | object = range(1, len(frames))
+    numbers: Iterable[int] = range(1, len(frames))
     if progress:
         from tqdm import tqdm
 
-        numbers = tqdm(range(1, len(frames)), desc="odometry", unit="frame", disable=None)
-    for k in numbers:  # type: ignore[attr-defined]
+        numbers = tqdm(numbers, total=len(frames) - 1, desc="odometry", unit="frame", disable=None)
+    for k in numbers:
         state, taken = step(setup, state, frames.frame(k))
         steps.append(taken)
     return Odometry(

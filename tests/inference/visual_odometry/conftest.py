@@ -12,6 +12,7 @@ from nolbo_ppl.geometry.pose import chain, se3_exp
 
 INTRINSICS = np.array([200.0, 200.0, 192.0, 96.0])
 HEIGHT, WIDTH = 192, 384
+SUPER = 3
 CAMERA_HEIGHT = 1.5
 
 
@@ -41,13 +42,13 @@ class Room:
     def frame(self, k: int, /) -> np.ndarray:
         """The image of a pose: nearest plane along each ray, texture looked up, a little noise."""
         T = self.T_world_camera[k]
-        v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64) + 0.5
+        v, u = (np.mgrid[0 : SUPER * HEIGHT, 0 : SUPER * WIDTH].astype(np.float64) + 0.5) / SUPER
         ray = np.stack([(u - INTRINSICS[2]) / INTRINSICS[0], (v - INTRINSICS[3]) / INTRINSICS[1], np.ones_like(u)], -1)
         ray = ray @ T[:3, :3].T
         origin = T[:3, 3]
         planes = [(0, self.half[0]), (0, -self.half[0]), (1, CAMERA_HEIGHT), (1, -4.0), (2, self.half[1]), (2, -self.half[1])]
         nearest = np.full(u.shape, np.inf)
-        image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)
+        image = np.zeros((*u.shape, 3), dtype=np.float32)
         for (axis, at), plane in zip(planes, self.textures):
             with np.errstate(divide="ignore", invalid="ignore"):
                 way = (at - origin[axis]) / ray[..., axis]
@@ -60,6 +61,7 @@ class Room:
             colour = cv2.remap(plane, x, y, cv2.INTER_LINEAR)
             image[hit] = colour[hit]
             nearest = np.where(hit, way, nearest)
+        image = image.reshape(HEIGHT, SUPER, WIDTH, SUPER, 3).mean(axis=(1, 3))
         rng = np.random.default_rng([self.seed, k])
         return np.clip(image + rng.normal(0, self.noise, image.shape), 0, 255).astype(np.uint8)
 
