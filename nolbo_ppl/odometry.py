@@ -84,8 +84,8 @@ def part_of(frames: FrameSequence, first: int, count: int | None) -> Part:
 
 def frame_times(part: Part) -> np.ndarray | None:
     """Times of the frames in s; None unless all are known."""
-    times = [part.frames.time(part.first + k) for k in range(len(part))]
-    return None if any(stamp is None for stamp in times) else np.array(times, dtype=np.float64)
+    times = part.frames.times
+    return None if times is None else times[part.first : part.first + len(part)]
 
 
 def true_poses(path: Path, part: Part) -> np.ndarray:
@@ -173,7 +173,7 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
     truth = None if arguments.truth is None else true_poses(arguments.truth, part)
     scale = scale_of(arguments, part, truth)
     begin = time.perf_counter()
-    odometry = estimate_odometry(part, intrinsics.vector, scale, arguments.config, progress=True)
+    odometry = estimate_odometry(part, intrinsics, scale, arguments.config, progress=True)
     figures = summary(odometry, truth, time.perf_counter() - begin)
     options = {name: str(value) if isinstance(value, Path) else value
                for name, value in asdict(arguments).items() if name != "config"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nolbo_ppl.data.frames.intrinsics import CameraIntrinsics, read_intrinsics, write_intrinsics
+from nolbo_ppl.data.frames.intrinsics import CameraIntrinsics, read_camera, read_intrinsics, write_camera
 from nolbo_ppl.data.frames.opening import open_frames
 from nolbo_ppl.data.frames.sequence import FrameSequence, ImageFolder, TumFolder, read_lengths, read_times
 from nolbo_ppl.data.frames.video import VideoFile
@@ -14,8 +14,9 @@ __all__ = [
     "TumFolder",
     "VideoFile",
     "open_frames",
+    "read_camera",
     "read_intrinsics",
     "read_lengths",
     "read_times",
-    "write_intrinsics",
+    "write_camera",
 ]

@@ -132,7 +132,12 @@ def _numbers(words: list[str], path: Path, line: int) -> list[float]:
         raise input_error("not a row of numbers", got=repr(" ".join(words)[:80]), file=path, line=line) from None
 
 
-def read_intrinsics(path: str | PathLike[str], size: tuple[int, int] | None = None) -> CameraIntrinsics:
+def read_intrinsics(path: str | PathLike[str], size: tuple[int, int] | None = None) -> Float[np.ndarray, " 4"]:
+    """[fx, fy, cx, cy] in px of a file that `read_camera` reads. Raises `InputError` naming file and line."""
+    return read_camera(path, size).vector
+
+
+def read_camera(path: str | PathLike[str], size: tuple[int, int] | None = None) -> CameraIntrinsics:
     """Read intrinsics: JSON with fx, fy, cx, cy (and width, height), a KITTI calibration (P2, else P0), or four numbers.
 
     Values are taken as they stand; calibrations that place the first pixel's centre at (0, 0), as OpenCV's do, are half
@@ -152,6 +157,6 @@ def read_intrinsics(path: str | PathLike[str], size: tuple[int, int] | None = No
     return checked(values, size, path, line)
 
 
-def write_intrinsics(path: str | PathLike[str], values: CameraIntrinsics) -> None:
+def write_camera(path: str | PathLike[str], values: CameraIntrinsics) -> None:
     """Write `intrinsics.json`, atomically."""
     write_json(path, values.as_dict())

@@ -55,6 +55,12 @@ class FrameSequence(ABC):
     def size(self) -> tuple[int, int]:
         """Width and height of the frames, px."""
 
+    @property
+    def times(self) -> Float[np.ndarray, " n"] | None:
+        """Times of all frames in s; None unless all are known."""
+        stamps = [self.time(k) for k in range(len(self))]
+        return None if any(stamp is None for stamp in stamps) else np.array(stamps, dtype=np.float64)
+
     def depth(self, k: int, /) -> Float[np.ndarray, "h w"] | None:
         """Depth of frame k in m, 0 where unknown; None where there is no depth image."""
         self.check(k)
@@ -157,7 +163,7 @@ class ImageFolder(FrameSequence):
         listing: tuple[Path, Sequence[int]] | None = None,
     ) -> None:
         """Frames in these files; `listing` is the file that lists them and the line of each, for messages."""
-        self.path, self.files, self.times, self._listing = Path(path), list(files), times, listing
+        self.path, self.files, self._times, self._listing = Path(path), list(files), times, listing
         if not self.files:
             raise input_error("no image", expected="files ending in " + ", ".join(IMAGE_SUFFIXES), file=self.path)
         self._size: tuple[int, int] | None = None
@@ -191,7 +197,7 @@ class ImageFolder(FrameSequence):
     def time(self, k: int, /) -> float | None:
         """Time of frame k in s."""
         self.check(k)
-        return None if self.times is None else float(self.times[k])
+        return None if self._times is None else float(self._times[k])
 
     def name(self, k: int, /) -> str:
         """File name of frame k."""
