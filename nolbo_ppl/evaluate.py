@@ -80,7 +80,7 @@ class EvaluateConfig:
     batch: int = 32
     """Scenes that go through the network at once."""
     pictures: bool = True
-    """Draw plots and examples."""
+    """Draw plots and examples, and put them with every figure into index.html."""
 
 
 def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
@@ -233,7 +233,7 @@ def _number(value: float | None) -> str:
 
 
 def run(config: EvaluateConfig) -> Evaluation:
-    """Measure the model and write `metrics.json` and, unless switched off, the plots and examples into `config.out`."""
+    """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`."""
     model: ObservationModel | Pyramid = load(config.model)
     if config.sizes:
         model = Pyramid(model, config.sizes)
@@ -245,14 +245,29 @@ def run(config: EvaluateConfig) -> Evaluation:
         rng = np.random.default_rng([config.seed, 1])
         estimates = {**evaluation.figures, **retrieval_figures(found, rng, config.resamples)}
         evaluation = replace(evaluation, figures=estimates, retrieval=found)
-    write_json(config.out / "metrics.json", metrics(evaluation, config))
+    values = metrics(evaluation, config)
+    write_json(config.out / "metrics.json", values)
     if config.pictures:
-        from nolbo_ppl.viz.evaluation import write_plots
-        from nolbo_ppl.viz.examples import write_examples
-
-        write_plots(evaluation.objects, evaluation.detections, evaluation.categories, model.config.symmetry, config.out)
-        write_examples(evaluation.objects, scenes, model, config.out / "examples.png")
+        _draw(evaluation, values, scenes, model, config.out)
     return evaluation
+
+
+def _draw(
+    evaluation: Evaluation, values: dict[str, Any], scenes: Scenes, model: ObservationModel | Pyramid, out: Path
+) -> None:
+    """Plots, examples, and the page that shows them with every figure."""
+    from nolbo_ppl.viz.detections import write_detections
+    from nolbo_ppl.viz.evaluation import write_plots
+    from nolbo_ppl.viz.evaluation_page import write_page
+    from nolbo_ppl.viz.examples import write_examples
+
+    objects, found = evaluation.objects, evaluation.detections
+    pictures = write_plots(objects, found, evaluation.categories, model.config.symmetry, out, evaluation.retrieval)
+    write_examples(objects, scenes, model, out / "examples.png")
+    pictures.append(out / "examples.png")
+    if write_detections(found.all, scenes, model, out / "detections.png") is not None:
+        pictures.append(out / "detections.png")
+    write_page(values, pictures, out / "index.html")
 
 
 def main(args: Sequence[str] | None = None) -> None:

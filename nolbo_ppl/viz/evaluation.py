@@ -14,6 +14,7 @@ from nolbo_ppl.metrics.calibration import Reliability, reliability, top_label
 from nolbo_ppl.metrics.detection import Matches, average_precision, precision_recall
 from nolbo_ppl.metrics.figures import DetectionRecords, ObjectRecords, confusion, judged
 from nolbo_ppl.metrics.intervals import wilson_interval
+from nolbo_ppl.metrics.retrieval import SCORES, RetrievalRecords
 from nolbo_ppl.metrics.viewpoint import ACCURATE
 from nolbo_ppl.viz.style import INK, MUTED, category_colour, grid, new_figure, save, styled
 
@@ -32,7 +33,7 @@ REGIONS = {
 
 def write_plots(
     objects: ObjectRecords, detections: DetectionRecords, categories: Sequence[str], symmetry: Sequence[int],
-    out: str | PathLike[str],
+    out: str | PathLike[str], retrieval: RetrievalRecords | None = None,
 ) -> list[Path]:
     """Write every plot as a PNG into a folder and return their paths."""
     figures = {
@@ -41,6 +42,8 @@ def write_plots(
         "confusion.png": draw_confusion(objects, categories),
         "viewpoint.png": draw_viewpoint(objects, categories, symmetry),
     }
+    if retrieval is not None:
+        figures["retrieval.png"] = draw_retrieval(retrieval, categories)
     paths = []
     for name, figure in figures.items():
         paths.append(Path(out) / name)
@@ -211,3 +214,36 @@ def _by_category(
     axes.set_yticks([], minor=True)
     axes.set_title("by category (* up to the declared symmetry)")
     grid(axes, "y")
+
+
+def draw_retrieval(records: RetrievalRecords, categories: Sequence[str]) -> Figure:
+    """Recall against the number of places looked at, by score; recall at the first place by category."""
+    with styled():
+        figure = new_figure(11.0, 4.2)
+        left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
+        places = np.arange(1, int(records.gallery.max()) + 1)
+        for name, colour in zip(SCORES, ("#2f6fde", "#76b7b2", "#e15759")):
+            recall = (records.rank[name].reshape(-1)[:, None] <= places).mean(0)
+            left.step(places, recall, where="post", color=colour, linewidth=1.6, label=f"{name}  {recall[0]:.3f}")
+        chance = (places / records.gallery[:, None]).clip(max=1).mean(0)
+        left.plot(places, chance, color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)), label=f"chance  {chance[0]:.3f}")
+        left.set(xscale="log", ylim=(0, 1.02), xlabel="first places looked at", ylabel="recall", title="same instance found")
+        left.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        left.legend(loc="upper left", title="at the first place")
+        grid(left)
+        known = [label for label in range(len(categories)) if (records.category == label).any()]
+        for place, label in enumerate(known):
+            rows = records.category == label
+            first = (records.rank["evidence"][rows] == 1).mean(1)
+            low, high = wilson_interval(float(first.sum()), len(first))
+            colour = category_colour(categories[label], tuple(categories))
+            right.bar(place, first.mean(), 0.7, color=colour, alpha=0.75)
+            right.errorbar(
+                place, first.mean(), [[first.mean() - low], [high - first.mean()]], color=INK, elinewidth=1.0, capsize=2
+            )
+            right.plot([place - 0.4, place + 0.4], [float((1 / records.gallery[rows]).mean())] * 2, color=MUTED, linewidth=0.9)
+        right.set_xticks(range(len(known)), [categories[label] for label in known], rotation=40, ha="right")
+        right.set(ylim=(0, 1.02), ylabel="recall at the first place", title="by category (evidence ratio; line: chance)")
+        grid(right, "y")
+        figure.subplots_adjust(left=0.06, right=0.985, bottom=0.19, top=0.91, wspace=0.16)
+    return figure
