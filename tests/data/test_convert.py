@@ -146,3 +146,18 @@ def test_real_files_convert_and_read_back(data_dir: Path, tmp_path: Path) -> Non
     assert np.median(spread) < 0.15
     box = convert_ycbv_slam(data_dir / "ycbv_slam", "0033")
     assert box.odometry.format == "tum" and len(box.observations) > 50
+
+
+def test_ycbv_states_the_drift_it_added(tmp_path: Path) -> None:
+    n = 30
+    identity = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (n, 1))
+    camera = identity.copy()
+    camera[:, 2] = np.arange(n) * 0.01
+    arrays = {"t": np.arange(n) / 30, "cam_gt": camera, "odom_est": camera, "det_initial/cup": identity, "gt/cup": identity}
+    np.savez(tmp_path / "0001.npz", **arrays)  # type: ignore[arg-type]
+    data = convert_ycbv_slam(tmp_path, "0001", rotation_drift=0.02, translation_drift=0.005)
+    assert data.odometry_covariance is not None and data.odometry_covariance.shape == (2, 6, 6)
+    np.testing.assert_allclose(np.sqrt(np.diag(data.odometry_covariance[0])), [0.02] * 3 + [0.005] * 3)
+    write_converted(tmp_path / "out", data)
+    with np.load(tmp_path / "out" / "odometry_covariance.npz", allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["covariance"], data.odometry_covariance)

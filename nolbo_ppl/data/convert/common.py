@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from nolbo_ppl.data.observations import ObservationTable, write_observations
 from nolbo_ppl.data.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io import write_json
+from nolbo_ppl.io import atomic_path, write_json
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,22 @@ class Converted:
     """Rows whose truth can be relied on."""
     T_world_object: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """True poses of static objects, where known."""
+    odometry_covariance: Float[np.ndarray, "n-1 6 6"] | None = None
+    """Covariance of every odometry step, where it is known (see `SlamProblem`)."""
     source: dict[str, Any] = field(default_factory=dict)
     """Where it came from and with what settings, for the record."""
 
 
 def write_converted(out: str | PathLike[str], data: Converted) -> None:
-    """Write `odometry.txt`, `truth.txt`, `observations.jsonl`, `objects.json` (true object of each id) and
-    `source.json`.
+    """Write `odometry.txt`, `truth.txt`, `observations.jsonl`, `objects.json` (true object of each id), `source.json`, and
+    `odometry_covariance.npz` where the covariance of the odometry is known.
     """
     out = Path(out)
     write_trajectory(out / "odometry.txt", data.odometry)
     write_trajectory(out / "truth.txt", data.truth)
+    if data.odometry_covariance is not None:
+        with atomic_path(out / "odometry_covariance.npz") as temporary:
+            np.savez_compressed(temporary, covariance=data.odometry_covariance)
     write_observations(out / "observations.jsonl", data.observations)
     write_json(out / "objects.json", {
         "objects": dict(zip(data.observations.id, data.objects)),

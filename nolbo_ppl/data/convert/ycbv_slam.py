@@ -40,7 +40,7 @@ def convert_ycbv_slam(
     data: str | PathLike[str], sequence: str, *, detections: str = "det_initial", every: int = 10, seed: int = 0,
     rotation_drift: float = np.deg2rad(1.0), translation_drift: float = 0.005,
 ) -> Converted:
-    """Keyframes of one sequence; each odometry step between them gets seeded noise.
+    """Keyframes of one sequence; each odometry step between them gets seeded noise, which is stated as its covariance.
 
     Args:
         data: folder of the NPZ files (`ycbv_slam`).
@@ -89,7 +89,10 @@ def convert_ycbv_slam(
     settings = {"kind": "ycbv-slam", "sequence": sequence, "detections": detections, "every": every, "seed": seed,
                 "rotation_drift": rotation_drift, "translation_drift": translation_drift}
     times = np.asarray(arrays["t"], dtype=np.float64)[keep]
+    # The real odometry's own errors are far below the drift added to it.
+    covariance = np.diag(np.repeat(np.maximum([rotation_drift, translation_drift], 1e-4) ** 2, 3))
     return Converted(
         odometry=Trajectory(odometry, times, "tum"), truth=Trajectory(truth, times, "tum"), observations=table,
-        objects=tuple(labels), trusted=np.ones(len(keep), bool), T_world_object=world, source=settings,
+        objects=tuple(labels), trusted=np.ones(len(keep), bool), T_world_object=world,
+        odometry_covariance=np.tile(covariance, (len(steps), 1, 1)), source=settings,
     )

@@ -22,8 +22,9 @@ CLIP = 3.0
 """Whitened residuals are clipped here before they are correlated."""
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
-UNSTATED_FACTOR = 4.0
-"""Least factor where nobody stated a scale: detectors are biased by view, which residuals about one track do not show."""
+UNSTATED_FACTOR, UNSTATED_RANGE_FACTOR, UNSTATED_ROTATION_FACTOR = 4.0, 16.0, 16.0
+"""Least factors where nobody stated a scale: detectors are biased by view, most of all in depth and orientation, which
+residuals about one track do not show."""
 LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
@@ -61,8 +62,10 @@ def calibrate(state: SlamState) -> SlamState:
     table, rows = state.problem.observations, state.rows
     noise, config = state.noise, state.config
     if len(rows) < LEAST_DETECTIONS:
-        unstated = 1.0 if np.isfinite(table.position_covariance[rows]).any() else UNSTATED_FACTOR
-        return replace(state, noise=replace(noise, position_factor=unstated, rotation_factor=unstated))
+        if not np.isfinite(table.position_covariance[rows]).any():
+            noise = replace(noise, position_factor=UNSTATED_FACTOR, range_factor=UNSTATED_RANGE_FACTOR,
+                            rotation_factor=UNSTATED_ROTATION_FACTOR)
+        return replace(state, noise=noise)
     frame = table.frame[rows]
     count = np.bincount(state.landmark, minlength=len(state.static))[state.landmark].astype(np.float64)
     report, warnings = dict(noise.report), list(noise.warnings)
@@ -76,10 +79,10 @@ def calibrate(state: SlamState) -> SlamState:
     factor = np.where(stated, _stated_factor(ratio, "position", stated[rows], config.correct_scales, warnings),
                       np.nan_to_num(max(ratio, 1.0), nan=1.0))
     report["position_track_width"] = ratio
-    least = 1.0 if stated[rows].any() else UNSTATED_FACTOR
-    report["position_correlation_factor"] = position_factor = max(correlation_factor(z, state.landmark, frame), least)
+    across, along = (1.0, 1.0) if stated[rows].any() else (UNSTATED_FACTOR, UNSTATED_RANGE_FACTOR)
+    report["position_correlation_factor"] = position_factor = correlation_factor(z, state.landmark, frame)
     noise = replace(noise, position_covariance=noise.position_covariance * (factor**2)[:, None, None],
-                    position_factor=position_factor)
+                    position_factor=max(position_factor, across), range_factor=max(position_factor, along))
     oriented = np.flatnonzero(table.has_rotation[rows])
     if len(oriented) >= LEAST_DETECTIONS:
         k, j = rows[oriented], state.landmark[oriented]
@@ -95,7 +98,7 @@ def calibrate(state: SlamState) -> SlamState:
             factor = np.where(stated, _stated_factor(ratio, "rotation", stated[k], config.correct_scales, warnings),
                               np.nan_to_num(max(ratio, 1.0), nan=1.0))
             report["rotation_track_width"] = ratio
-            least = 1.0 if stated[k].any() else UNSTATED_FACTOR
+            least = 1.0 if stated[k].any() else UNSTATED_ROTATION_FACTOR
             report["rotation_correlation_factor"] = rotation_factor = max(
                 correlation_factor(w, j, table.frame[k]), least
             )

@@ -155,7 +155,9 @@ class NoiseModel:
     warnings: tuple[str, ...] = ()
     """Stated scales found too small, in words."""
     position_factor: float = 1.0
-    """Factor on position covariances in the graph, for errors that resemble one another from frame to frame."""
+    """Factor on position covariances in the graph, across the ray, for errors that resemble one another from frame to frame."""
+    range_factor: float = 1.0
+    """The same along the ray: depth is what detectors are biased in."""
     rotation_factor: float = 1.0
     """The same for orientations."""
     step_correlation: Float[np.ndarray, "n-1 6 6"] | None = None

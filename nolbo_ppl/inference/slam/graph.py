@@ -92,6 +92,15 @@ def landmark_key(j: int) -> int:
     return gtsam.symbol("l", int(j))
 
 
+def widened(
+    covariance: Float[np.ndarray, "k 3 3"], position: Float[np.ndarray, "k 3"], across: float, along: float
+) -> Float[np.ndarray, "k 3 3"]:
+    """Covariances of observed positions multiplied by one factor across the ray and another along it."""
+    ray = position / np.maximum(np.linalg.norm(position, axis=1, keepdims=True), 1e-9)
+    root = np.sqrt(across) * np.eye(3) + (np.sqrt(along) - np.sqrt(across)) * ray[:, :, None] * ray[:, None, :]
+    return root @ covariance @ root
+
+
 def resolve_observations(
     problem: SlamProblem, noise: NoiseModel, config: SlamConfig, estimate: Estimate, rows: Int[np.ndarray, " k"],
     landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"],
@@ -116,7 +125,8 @@ def resolve_observations(
     covariance = np.zeros((len(k), 6, 6))
     covariance[:, [0, 1, 2], [0, 1, 2]] = (np.where(informative, angular, LOOSE_ROTATION) ** 2)[:, None]
     covariance[informative & (symmetry[k] == 0), 2, 2] = LOOSE_ROTATION**2
-    covariance[:, 3:, 3:] = noise.position_factor * (np.swapaxes(R, 1, 2) @ noise.position_covariance[rows[k]] @ R)
+    S = widened(noise.position_covariance[rows[k]], table.position[rows[k]], noise.position_factor, noise.range_factor)
+    covariance[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ S @ R
     share = np.concatenate([np.ones(len(plain)), modes.responsibility])
     return ObservationFactors(frame[k], landmark[k], make_pose(R, table.position[rows[k]]), covariance, weight[k] * share)
 

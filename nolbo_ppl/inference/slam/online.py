@@ -16,19 +16,14 @@ from nolbo_ppl.data.observations import ObservationTable, concatenate
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
-from nolbo_ppl.inference.slam.drift import DriftGraph
-from nolbo_ppl.inference.slam.em import link_arrays
-from nolbo_ppl.inference.slam.evidence import TrackletFeatures
 from nolbo_ppl.inference.slam.features import detection_features, fit_prior, fuse_latent
-from nolbo_ppl.inference.slam.graph import Estimate
 from nolbo_ppl.inference.slam.noise import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
 from nolbo_ppl.inference.slam.online_graph import OnlineGraph
-from nolbo_ppl.inference.slam.online_loops import Track, find_links, track_samples
+from nolbo_ppl.inference.slam.online_loops import LoopCloser, Track
 from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.state import init, init_from_tracklets
-from nolbo_ppl.inference.slam.state_types import link_scale
 from nolbo_ppl.inference.slam.tracklets import Tracker, summarise_tracks
 
 
@@ -64,10 +59,7 @@ class ObjectSlam:
         self.assigned: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
         self.tracks: dict[int, Track] = {}
-        self.track_of_landmark: list[int] = []
-        self.links: list[tuple[int, int]] = []
-        self.drift = DriftGraph()
-        self.fresh: list[int] = []
+        self.loops: LoopCloser | None = None
         self.pending: dict[int, list[tuple[int, SlamProblem, NoiseModel, int]]] = {}
         self.graph = OnlineGraph()
         self.step_covariances: list[np.ndarray] = []
@@ -110,12 +102,13 @@ class ObjectSlam:
         self.assigned.append(assigned)
         self.weights.append(weight)
         self.seen += len(table)
-        self._remember(table, noise, assigned, start, odometry, frame)
-        self._add_factors(problem, noise, assigned, odometry, frame)
+        self._remember(table, noise, assigned, start, frame)
+        self._add_factors(problem, noise, assigned, frame)
         self.graph.commit()
-        closings = self._close(frame, noise)
+        assert self.loops is not None
+        closings = self.loops.close(frame, self.graph, noise)
         self.T_world_camera = self.graph.pose(frame)
-        return OnlineInfo(frame, self.T_world_camera, len(self.track_of_landmark), closings)
+        return OnlineInfo(frame, self.T_world_camera, self.graph.landmarks, closings)
 
     def _begin(self, table: ObservationTable) -> None:
         """At the first keyframe: scales of the reference, and the prior of features."""
@@ -152,19 +145,20 @@ class ObjectSlam:
                 new_rate=reference.new_rate,
                 clutter_rate=reference.clutter_rate,
             )
-            self.factors = (reference.position_factor, reference.rotation_factor)
+            self.factors = (reference.position_factor, reference.range_factor, reference.rotation_factor)
         else:
             self.prior = fit_prior(table, self.config)
-            self.factors = (1.0, 1.0)
+            self.factors = (1.0, 1.0, 1.0)
             rate = 1e-3
             self.config = replace(self.config, new_rate=self.config.new_rate or rate,
                                   clutter_rate=self.config.clutter_rate or 0.5 * rate)
+        self.loops = LoopCloser(self.config, self.prior)
         self.tracker = Tracker(self.config, table.latent_dim, self.prior, float(self.config.new_rate or 1e-3),
                                float(self.config.clutter_rate or 1e-3))
 
     def _noise(self, problem: SlamProblem) -> NoiseModel:
         noise = estimate_noise(problem, self.config)
-        return replace(noise, position_factor=self.factors[0], rotation_factor=self.factors[1])
+        return replace(noise, position_factor=self.factors[0], range_factor=self.factors[1], rotation_factor=self.factors[2])
 
     def _add_pose(self, odometry: np.ndarray, frame: int, covariance: np.ndarray | None) -> tuple[float, float]:
         """Odometry factor and first value of the new pose; scales of the step."""
@@ -180,7 +174,8 @@ class ObjectSlam:
         self.T_world_camera = self.T_world_camera @ step
         self.graph.add_pose(step, covariance, self.T_world_camera)
         rotation, translation = (float(np.sqrt(np.trace(covariance[part, part]) / 3)) for part in (slice(3), slice(3, 6)))
-        self.drift.advance(self.T_world_camera, rotation, translation)
+        assert self.loops is not None
+        self.loops.drift.advance(self.T_world_camera, rotation, translation)
         return rotation, translation
 
     def _step_covariance(self, length: float) -> np.ndarray:
@@ -229,7 +224,6 @@ class ObjectSlam:
         noise: NoiseModel,
         assigned: np.ndarray,
         start: int,
-        odometry: np.ndarray,
         frame: int,
     ) -> None:
         """Fuse features of each detection into its track."""
@@ -239,10 +233,8 @@ class ObjectSlam:
             if number < 0:
                 continue
             if number not in self.tracks:
-                oriented = bool(table.has_rotation[i])
-                R = odometry[:3, :3] @ table.rotation[i] if oriented else np.eye(3)
                 self.tracks[number] = Track([start + i], -1, latent[i], variance[i], int(category[i]), int(symmetry[i]),
-                                            oriented, frame, frame, R)
+                                            bool(table.has_rotation[i]), frame, frame)
                 continue
             track = self.tracks[number]
             track.rows.append(start + i)
@@ -252,7 +244,7 @@ class ObjectSlam:
             )
 
     def _add_factors(
-        self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, odometry: np.ndarray, frame: int
+        self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int
     ) -> None:
         """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
         for i, number in enumerate(assigned.tolist()):
@@ -263,57 +255,20 @@ class ObjectSlam:
                 self.pending.setdefault(number, []).append((frame, problem, noise, i))
                 continue
             if track.landmark < 0:
-                self._found(track, number, problem.observations, i)
+                self._found(track, problem.observations, i)
                 for earlier, its_problem, its_noise, k in self.pending.pop(number, []):
                     self.graph.observe(its_problem, its_noise, self.config, k, earlier, self.graph.pose(earlier), track.landmark)
             self.graph.observe(problem, noise, self.config, i, frame, self.T_world_camera, track.landmark)
         for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
             del self.pending[number]
 
-    def _found(self, track: Track, number: int, table: ObservationTable, i: int) -> None:
+    def _found(self, track: Track, table: ObservationTable, i: int) -> None:
         """A new landmark at its latest detection, with its weak prior."""
         R = self.T_world_camera[:3, :3] @ table.rotation[i] if np.isfinite(table.rotation[i, 0, 0]) else np.eye(3)
         T = make_pose(R, transform(self.T_world_camera, table.position[i]))
         track.landmark = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])))
-        self.track_of_landmark.append(number)
-        self.fresh.append(track.landmark)
-
-    # -- loops --------------------------------------------------------------------------------------------------------
-
-    def _close(self, frame: int, noise: NoiseModel) -> int:
-        """Match the newest window of ended tracks once enough of them are new; returns the number of links added."""
-        ended = [j for j in self.fresh if frame - self.tracks[self.track_of_landmark[j]].last > 1]
-        half = max(self.config.constellation_size // 2, 1)
-        if len(ended) < half:
-            return 0
-        self.fresh = [j for j in self.fresh if j not in set(ended)]
-        window = np.unique([*ended, *range(max(min(ended) - half, 0), min(ended))])
-        tracks = [self.tracks[number] for number in self.track_of_landmark]
-        poses = np.array([self.graph.landmark(j) for j in range(len(tracks))])
-        rng = np.random.default_rng([self.config.seed, frame])
-        samples = track_samples(poses, tracks, noise, self.drift, self.config.samples, rng)
-        floor = link_scale(noise)
-        found, features = find_links(window, tracks, Estimate(self.T_world_camera[None], poses), samples, self.prior,
-                                     self.config, self.links, floor=floor, new_rate=noise.new_rate)
-        if found:
-            self._link(found, poses, features, tracks, floor)
-        return len(found)
-
-    def _link(
-        self,
-        found: list[tuple[int, int]],
-        poses: np.ndarray,
-        features: TrackletFeatures,
-        tracks: list[Track],
-        scale: float,
-    ) -> None:
-        pairs = np.array(found, dtype=np.int64)
-        links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
-        for i, j in found:
-            self.drift.close((tracks[i].first + tracks[i].last) // 2, (tracks[j].first + tracks[j].last) // 2,
-                             poses[j, :3, 3], 2 * scale)
-        self.links += found
-        self.graph.link(links)
+        assert self.loops is not None
+        self.loops.add(track)
 
     # -- answers ------------------------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ class OnlineGraph:
     def __init__(self) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(0.05)
-        parameters.relinearizeSkip = 5
+        parameters.relinearizeSkip = 10
         # Landmarks hang on weak priors beside a nearly fixed first pose: QR takes that spread, Cholesky does not.
         parameters.setFactorization("QR")
         self.isam = gtsam.ISAM2(parameters)
@@ -73,10 +73,9 @@ class OnlineGraph:
         add_observation_factors(self.graph, factors)
 
     def link(self, links: Links) -> None:
-        """Tie landmarks together and relinearise until the graph follows."""
+        """Tie landmarks together; the linearisation points follow with the next keyframes."""
         add_links(self.graph, links, None)
         self.commit()
-        self.isam.update()
 
     def commit(self) -> None:
         """Hand what waits to iSAM2.
