@@ -8,7 +8,8 @@ is also how the single part of a CAD mesh without materials is drawn.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -74,6 +75,20 @@ def material_table(materials: Sequence[Material]) -> MaterialTable:
         contrast=column("contrast"),
         frequency=column("frequency"),
     )
+
+
+@lru_cache(maxsize=8192)
+def _known_table(materials: tuple[Material, ...]) -> MaterialTable:
+    return material_table(materials)
+
+
+def stacked_table(groups: Sequence[tuple[Material, ...]]) -> MaterialTable:
+    """The materials of several meshes in one table; those of each mesh are turned into arrays once."""
+    tables = [_known_table(materials) for materials in groups if materials]
+    if not tables:
+        return material_table([])
+    names = [field.name for field in fields(MaterialTable)]
+    return MaterialTable(**{name: np.concatenate([getattr(table, name) for table in tables]) for name in names})
 
 
 def hsv(hue: float, saturation: float, value: float) -> tuple[float, float, float]:

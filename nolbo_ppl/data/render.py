@@ -8,13 +8,14 @@ object without the others, which its visibility needs, comes for free.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from nolbo_ppl.data import shading
-from nolbo_ppl.data.materials import material_table
+from nolbo_ppl.data.materials import stacked_table
 from nolbo_ppl.data.view import Placed, View
 
 NEAR = 1e-3
@@ -37,6 +38,8 @@ class Hits:
     """Pixels in which each labelled object is in front."""
     owner_silhouette: dict[int, float]
     """Pixels each labelled object covers when it is alone, beyond the border included."""
+    windows: tuple[Float[np.ndarray, " 4"] | None, ...]
+    """Box px of all that each mesh may cover, None when it is out of sight."""
 
 
 def pixel_directions(
@@ -72,6 +75,22 @@ def image_window(placed: Placed, intrinsics: Float[np.ndarray, " 4"]) -> Float[n
     return np.concatenate((pixels.min(axis=0), pixels.max(axis=0)))
 
 
+def _trace_window(placed: Placed, view: View) -> Float[np.ndarray, " 4"] | None:
+    """Box px of all that a mesh may cover, without bounds where it reaches behind the camera; None when out of sight."""
+    window = image_window(placed, view.intrinsics)
+    if window is not None:
+        return window
+    points = placed.vertices
+    ahead = points[points[:, 2] > NEAR]
+    if not len(ahead):
+        return None
+    pixels = ahead[:, :2] / ahead[:, 2:] * view.intrinsics[:2] + view.intrinsics[2:]
+    # What comes near the camera's plane goes to infinity on its own side: both, where the mesh has vertices on both.
+    low = np.where((points[:, :2] < 0).any(axis=0), -np.inf, pixels.min(axis=0))
+    high = np.where((points[:, :2] > 0).any(axis=0), np.inf, pixels.max(axis=0))
+    return np.concatenate((low, high))
+
+
 def trace(view: View) -> Hits:
     """Cast one ray through each pixel centre: the mesh in front, and each mesh's own silhouette.
 
@@ -82,11 +101,10 @@ def trace(view: View) -> Hits:
     index = np.full((height, width), -1, dtype=np.int32)
     face = np.full((height, width), -1, dtype=np.int32)
     silhouette = np.zeros(len(view.placed))
-    for k, placed in enumerate(view.placed):
-        if placed.vertices[:, 2].max() <= NEAR:
+    windows = tuple(_trace_window(placed, view) for placed in view.placed)
+    for k, (placed, window) in enumerate(zip(view.placed, windows)):
+        if window is None:
             continue
-        window = image_window(placed, view.intrinsics)
-        window = np.array([0.0, 0.0, width, height]) if window is None else window
         x0, y0 = np.maximum(np.floor(window[:2]), [-width, -height]).astype(int)
         x1, y1 = np.minimum(np.ceil(window[2:]), [2 * width, 2 * height]).astype(int)
         a0, b0, a1, b1 = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
@@ -109,7 +127,48 @@ def trace(view: View) -> Hits:
         depth, index, face, silhouette,
         owner_visible={p.owner: float(visible[p.owner + 1]) for p in view.placed if p.owner >= 0},
         owner_silhouette={p.owner: float(silhouette[k]) for k, p in enumerate(view.placed) if p.owner >= 0},
+        windows=windows,
     )  # fmt: skip
+
+
+def trace_pixels(
+    view: View,
+    windows: Sequence[Float[np.ndarray, " 4"] | None],
+    rows: Int[np.ndarray, " n"],
+    columns: Int[np.ndarray, " n"],
+    offsets: Float[np.ndarray, "s 2"],
+) -> tuple[Float[np.ndarray, "n s 2"], Int[np.ndarray, "n s"], Int[np.ndarray, "n s"], Float[np.ndarray, "n s"]]:
+    """Cast several rays through each of some pixels, which must be sorted by row.
+
+    Args:
+        view: what there is to see.
+        windows: `Hits.windows`.
+        rows: row of each pixel.
+        columns: column of each pixel.
+        offsets: (x, y) of the rays within a pixel, from 0 to 1.
+
+    Returns:
+        Slopes of the rays, and of what each meets the number in `View.placed` (or -1), the face, and the depth.
+    """
+    n, s = len(rows), len(offsets)
+    pixels = np.stack((columns, rows), axis=1)[:, None] + offsets
+    rays = np.ones((n, s, 3), dtype=np.float32)
+    rays[..., :2] = (pixels - view.intrinsics[2:]) / view.intrinsics[:2]
+    index, face = np.full((n, s), -1, dtype=np.int32), np.full((n, s), -1, dtype=np.int32)
+    depth = np.full((n, s), np.inf, dtype=np.float32)
+    for k, (placed, window) in enumerate(zip(view.placed, windows)):
+        if window is None:
+            continue
+        first, last = np.searchsorted(rows, [np.floor(window[1]), np.ceil(window[3])])
+        within = columns[first:last]
+        chosen = first + np.flatnonzero((within >= np.floor(window[0])) & (within < np.ceil(window[2])))
+        primitive, t = _first_hits(placed, rays[chosen].reshape(-1, 3))
+        primitive, t = primitive.reshape(-1, s), t.reshape(-1, s)
+        nearer = t < depth[chosen]
+        depth[chosen] = np.where(nearer, t, depth[chosen])
+        index[chosen] = np.where(nearer, k, index[chosen])
+        face[chosen] = np.where(nearer, primitive, face[chosen])
+    return rays[..., :2], index, face, depth
 
 
 def shadowed(
@@ -141,21 +200,46 @@ def _stack(arrays: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
-    """Linear RGB of every pixel: surfaces, then shadows, then light."""
+    """Linear RGB of every pixel."""
+    fx, fy, cx, cy = _f32(view.intrinsics)[0]
+    x = (np.arange(view.width, dtype=np.float32) + np.float32(0.5) - cx) / fx
+    y = (np.arange(view.height, dtype=np.float32) + np.float32(0.5) - cy) / fy
+    slopes = np.empty((view.height, view.width, 2), dtype=np.float32)
+    slopes[..., 0], slopes[..., 1] = x, y[:, None]
+    colour = shade_rays(view, slopes.reshape(-1, 2), hits.index.ravel(), hits.face.ravel(), hits.depth.ravel())
+    return colour.reshape(view.height, view.width, 3)
+
+
+def shade_rays(
+    view: View,
+    slopes: Float[np.ndarray, "n 2"],
+    index: Int[np.ndarray, " n"],
+    face: Int[np.ndarray, " n"],
+    depth: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
+    """Linear RGB of what rays meet: surfaces, then shadows, then light.
+
+    Args:
+        view: what there is to see; a background picture needs one ray a pixel, row by row.
+        slopes: x / z and y / z of each ray.
+        index: number of the mesh each meets, or -1.
+        face: face of that mesh.
+        depth: distance along the optical axis.
+    """
     meshes = [placed.mesh for placed in view.placed]
     counts = [len(mesh.faces) for mesh in meshes]
     materials = [len(placed.materials) for placed in view.placed]
-    table = material_table([m for placed in view.placed for m in placed.materials])
+    table = stacked_table([placed.materials for placed in view.placed])
     backdrop = view.backdrop
     up, north = _f32(view.up, view.north)
     wall = backdrop.wall if backdrop.wall is not None else backdrop.ground
     wall_normal = up if backdrop.wall_normal is None else _f32(backdrop.wall_normal)[0]
     points, normals, albedo, kind = shading.surfaces(
-        view.width,
-        _f32(view.intrinsics)[0],
-        hits.index.ravel(),
-        hits.face.ravel(),
-        hits.depth.ravel(),
+        slopes,
+        np.float32(view.intrinsics[0]),
+        index,
+        face,
+        depth,
         _stack([placed.inverse for placed in view.placed], (1, 3, 3)),
         _stack([placed.offset for placed in view.placed], (1, 3)),
         np.cumsum([0, *counts]),
@@ -186,9 +270,8 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
     picture, ambient_sky, ambient_ground = _f32(picture, view.ambient_sky, view.ambient_ground)
     zenith, horizon = _f32(backdrop.zenith, backdrop.horizon)
     (sky,) = _f32(np.eye(3) if backdrop.R_sky_camera is None else backdrop.R_sky_camera)
-    colour = shading.illuminate(
-        view.width,
-        _f32(view.intrinsics)[0],
+    return shading.illuminate(
+        slopes,
         points,
         normals,
         albedo,
@@ -213,7 +296,6 @@ def shade(view: View, hits: Hits) -> Float[np.ndarray, "height width 3"]:
         backdrop.picture is not None,
         picture,
     )
-    return colour.reshape(view.height, view.width, 3)
 
 
 GAMMA = np.linspace(0.0, 1.0, 8192, dtype=np.float32) ** np.float32(1 / 2.2)

@@ -89,7 +89,7 @@ def amodal_box(placed: Placed, view: View) -> Float[np.ndarray, " 4"]:
     return np.clip(window, 0, [view.width, view.height, view.width, view.height])
 
 
-def finer(view: View, factor: int) -> View:
+def _fine(view: View, factor: int) -> View:
     """The same view with `factor` times as many rays along each side."""
     if factor == 1:
         return view
@@ -122,7 +122,7 @@ def _seen_objects(scene: Scene, view: View) -> tuple[View, Hits, dict[int, float
         view = replace(view, placed=tuple(p for p in view.placed if p.owner < 0 or p.owner not in gone))
 
 
-def blurred(colour: np.ndarray, scale: float) -> np.ndarray:
+def _blurred(colour: np.ndarray, scale: float) -> np.ndarray:
     """Gaussian blur of a small scale (px): five taps along each axis."""
     if scale < 0.2:
         return colour
@@ -141,8 +141,8 @@ def render_scene(scene: Scene) -> Rendered:
     it is shaded, so that no image shows an object that its labels lack.
     """
     factor = scene.supersample
-    view, hits, visibility = _seen_objects(scene, finer(scene.view, factor))
-    colour = blurred(average_down(shade(view, hits), factor), scene.blur)
+    view, hits, visibility = _seen_objects(scene, _fine(scene.view, factor))
+    colour = _blurred(average_down(shade(view, hits), factor), scene.blur)
     noise = np.random.default_rng(scene.noise_seed).standard_normal(colour.shape, dtype=np.float32)
     image = to_display(colour, scene.exposure, np.float32(scene.noise) * noise)
     labels: list[ObjectLabel] = []

@@ -1,7 +1,7 @@
 """Compiled shading: what each pixel shows and how much light it sends. NumPy took three times as long.
 
-Arrays are flat over pixels (row by row) and single precision. `kind` is the material number of a pixel that shows a
-mesh, else `GROUND`, `WALL` or `SKY`.
+Arrays are flat over rays, which go through `slopes` (x / z and y / z), and single precision. `kind` is the material
+number of a ray that meets a mesh, else `GROUND`, `WALL` or `SKY`.
 """
 
 from __future__ import annotations
@@ -19,16 +19,6 @@ SKY = -3
 
 HAZE = 60.0
 """Distance, in camera heights, at which the ground has faded into the horizon."""
-
-
-@numba.njit(cache=True)
-def _ray(pixel: int, width: int, intrinsics: np.ndarray) -> tuple[float, float]:
-    """Slopes x / z and y / z of the ray through the centre of a pixel."""
-    row, column = pixel // width, pixel % width
-    half = np.float32(0.5)
-    x = (np.float32(column) + half - intrinsics[2]) / intrinsics[0]
-    y = (np.float32(row) + half - intrinsics[3]) / intrinsics[1]
-    return x, y
 
 
 @numba.njit(cache=True)
@@ -53,8 +43,8 @@ def _plane_albedo(
 
 @numba.njit(cache=True)
 def surfaces(
-    width: int,
-    intrinsics: np.ndarray,
+    slopes: np.ndarray,
+    focal: np.float32,
     index: np.ndarray,
     face: np.ndarray,
     depth: np.ndarray,
@@ -85,7 +75,7 @@ def surfaces(
     albedo = np.zeros((n, 3), dtype=np.float32)
     kind = np.empty(n, dtype=np.int32)
     for i in range(n):
-        x, y = _ray(i, width, intrinsics)
+        x, y = slopes[i, 0], slopes[i, 1]
         k = index[i]
         if k >= 0:
             z = depth[i]
@@ -113,7 +103,7 @@ def surfaces(
                     # Laid out on the face itself, and faded where a pixel covers more than its detail.
                     range2 = points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2
                     cosine = abs(towards) / (max(length, 1e-20) * math.sqrt(x * x + y * y + 1))
-                    pixel = math.sqrt(range2 / max(cosine, 0.02)) / intrinsics[0] * material_frequency[m]
+                    pixel = math.sqrt(range2 / max(cosine, 0.02)) / focal * material_frequency[m]
                     value = surface_pattern(int(material_pattern[m]), q, face_normals[f], texture_seed[k], pixel)
                 elif material_pattern[m] == 1:
                     value = float(noise_at(q[0], q[1], q[2], texture_seed[k], 1, True))
@@ -135,13 +125,13 @@ def surfaces(
                 points[i, 0], points[i, 1], points[i, 2] = x * z, y * z, z
                 normals[i] = -wall_normal
                 kind[i] = WALL
-                _plane_albedo(wall, points[i], normals[i], up, intrinsics[0], albedo[i])
+                _plane_albedo(wall, points[i], normals[i], up, focal, albedo[i])
                 continue
         if distance < np.inf:
             points[i, 0], points[i, 1], points[i, 2] = x * distance, y * distance, distance
             normals[i] = up
             kind[i] = GROUND
-            _plane_albedo(ground, points[i], up, north, intrinsics[0], albedo[i])
+            _plane_albedo(ground, points[i], up, north, focal, albedo[i])
     return points, normals, albedo, kind
 
 
@@ -193,8 +183,7 @@ def _sky(height: float, zenith: np.ndarray, horizon: np.ndarray, c: int) -> floa
 
 @numba.njit(cache=True)
 def illuminate(
-    width: int,
-    intrinsics: np.ndarray,
+    slopes: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
     albedo: np.ndarray,
@@ -225,7 +214,7 @@ def illuminate(
     diffuse = np.empty(3, dtype=np.float32)
     full = np.empty(3, dtype=np.float32)
     for i in range(n):
-        x, y = _ray(i, width, intrinsics)
+        x, y = slopes[i, 0], slopes[i, 1]
         length = math.sqrt(x * x + y * y + 1)
         ex, ey, ez = -x / length, -y / length, -1 / length
         if kind[i] == SKY:

@@ -10,6 +10,8 @@ from nolbo_ppl.errors import input_error
 WorldName = Literal["street", "indoor"]
 WORLDS: tuple[str, ...] = ("street", "indoor")
 PRESETS: tuple[str, ...] = ("default", "demo")
+LEAST_LOOP = {"street": 70.0, "indoor": 22.0}
+"""Shortest loop that leaves room for anything beside it, m."""
 MOST_FRAMES = 20_000
 """Frames a drive may have: the length of the loop grows with them."""
 
@@ -46,8 +48,8 @@ class DriveConfig:
     """Number of things that are no object: bins, cones, boxes, small heaps."""
     moving: int = 0
     """Objects that drive in the opposite lane (street without an opposite leg)."""
-    supersample: int = 1
-    """Rays a pixel along each side; 2 removes jagged edges and takes three times as long."""
+    supersample: int = 2
+    """Rays along each side of a pixel that differs from its neighbours; 1 is faster and leaves jagged edges."""
     noise: float = 0.006
     """Scale of the sensor noise, over full range."""
     least_visibility: float = 0.1
@@ -58,7 +60,7 @@ class DriveConfig:
     def __post_init__(self) -> None:
         if self.world not in WORLDS:
             raise input_error("unknown world", got=repr(self.world), expected=", ".join(WORLDS))
-        least = {"seed": 0, "frames": 2, "objects": 0, "clutter": 0, "moving": 0, "supersample": 1}
+        least = {"seed": 0, "frames": 2, "objects": 0, "clutter": 0, "moving": 0, "supersample": 1, "noise": 0}
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise input_error(f"{name} of the drive", got=getattr(self, name), expected=f"at least {bound}")
@@ -81,6 +83,11 @@ class DriveConfig:
                 "camera of the drive", got=f"height {self.camera_height} m, tilt {self.tilt} degrees",
                 expected="height of 0.3 to 2.5 m, tilt of -20 to 45 degrees",
             )  # fmt: skip
+        if self.perimeter < LEAST_LOOP[self.world]:
+            raise input_error(
+                "loop of the drive", got=f"{self.perimeter:.1f} m (step x frames / laps)",
+                expected=f"at least {LEAST_LOOP[self.world]:g} m", do="use more frames, a longer step or fewer laps",
+            )  # fmt: skip
         if self.moving and (self.world != "street" or self.opposite > 0):
             raise input_error(
                 "moving objects", got=f"{self.moving} in world {self.world!r} with opposite {self.opposite}",
@@ -101,9 +108,9 @@ def drive_preset(preset: str, world: WorldName, seed: int = 0) -> DriveConfig:
     """
     if preset not in PRESETS:
         raise input_error("unknown preset of a drive", got=repr(preset), expected=", ".join(PRESETS))
-    config = DriveConfig(world=world, seed=seed)
+    config = DriveConfig(world=world, seed=seed)  # raises for an unknown world
     if world == "indoor":
         config = replace(config, step=0.25, objects=160, clutter=60, camera_height=1.5, tilt=10.0)
     if preset == "demo":
-        config = replace(config, frames=120, laps=1.2, objects=60, clutter=40, step=0.4 if world == "indoor" else 1.0)
+        config = replace(config, frames=120, laps=1.2, objects=60, clutter=40, step=0.3 if world == "indoor" else 0.8)
     return config

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.data.antialias import shade_smoothly
 from nolbo_ppl.data.drive.placing import WorldObject
 from nolbo_ppl.data.drive.world import World
 from nolbo_ppl.data.record import record_of
-from nolbo_ppl.data.render import average_down, shade, to_display, trace
-from nolbo_ppl.data.scene import ObjectLabel, Rendered, amodal_box, blurred, finer
+from nolbo_ppl.data.render import to_display, trace
+from nolbo_ppl.data.scene import ObjectLabel, Rendered, amodal_box
 from nolbo_ppl.data.view import Light, Placed, View
 from nolbo_ppl.geometry.pose import inverse
 
@@ -85,10 +86,8 @@ def render_frame(world: World, frame: int) -> RenderedFrame:
     """
     config = world.config
     view, shown = frame_view(world, frame)
-    factor = config.supersample
-    fine = finer(view, factor)
-    hits = trace(fine)
-    colour = blurred(average_down(shade(fine, hits), factor), 0.0)
+    hits = trace(view)
+    colour = shade_smoothly(view, hits, config.supersample)
     noise = np.random.default_rng([config.seed, 9200, frame]).standard_normal(colour.shape, dtype=np.float32)
     image = to_display(colour, world.exposure, np.float32(config.noise) * noise)
     labels: list[ObjectLabel] = []
@@ -105,7 +104,7 @@ def render_frame(world: World, frame: int) -> RenderedFrame:
         number[k] = len(labels)
         labels.append(_label(shown[placed.owner], placed, box, visibility))
         ids.append(shown[placed.owner].id)
-    owner = number[hits.index[::factor, ::factor]]
+    owner = number[hits.index]
     return RenderedFrame(Rendered(image, world.intrinsics, tuple(labels), owner), tuple(ids))
 
 
