@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from tqdm import tqdm
 
+from nolbo_ppl.data.frames import FrameSequence
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.observations import Observations
 from nolbo_ppl.mission.depth import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
 
+STRUCTURED_LIGHT = 0.0015
+"""Growth of the error of a structured light camera's depth with its square, 1/m (Khoshelham and Elberink 2012)."""
 Picture = UInt8[np.ndarray, "h w 3"]
 
 
@@ -69,6 +72,23 @@ class StereoPairs:
         return stereo_depth(image, self.right(k), self.focal, self.baseline)
 
 
+class SequenceDepth:
+    """Depth the sequence itself brings (a TUM RGB-D folder), where it does.
+
+    Args:
+        frames: the images.
+        index: image of every keyframe.
+    """
+
+    def __init__(self, frames: FrameSequence, index: Sequence[int]) -> None:
+        self.frames, self.index, self.scale = frames, tuple(index), DepthScale(ratio=STRUCTURED_LIGHT)
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe."""
+        known = self.frames.depth(self.index[k])
+        return None if known is None else np.where(known > 0, known, np.nan)
+
+
 def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Path | None]:
     """The file of a folder that belongs to each image: of the same stem, or, where no stem fits, of the same number.
 
@@ -90,7 +110,7 @@ def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Pa
 
 def observed_rows(
     model: Observer, read: Callable[[int], Picture], names: Sequence[str], intrinsics: Float[np.ndarray, " 4"], *,
-    threshold: float, batch: int, depth: DepthSource | None = None, **options: Any,
+    threshold: float, batch: int, depth: DepthSource, **options: Any,
 ) -> Iterator[dict[str, Any]]:
     """Lines of `observations.jsonl`, batch by batch, with a progress bar on a terminal.
 
@@ -101,7 +121,7 @@ def observed_rows(
         intrinsics: [fx, fy, cx, cy], px.
         threshold: least objectness.
         batch: images in memory at once.
-        depth: refines positions where given.
+        depth: refines positions where it is known.
         options: passed on to the model.
     """
     with tqdm(total=len(names), desc="observing", unit="image", disable=None) as bar:
@@ -112,8 +132,8 @@ def observed_rows(
                 images, intrinsics, threshold=threshold, decode=False, batch=batch, **options
             )
             for k, image, observed in zip(frames, images, answers):
-                known = None if depth is None else depth.depth(k, image)
-                if depth is not None and known is not None:
+                known = depth.depth(k, image)
+                if known is not None:
                     observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
                 yield from observed.rows(k, names[k])
             bar.update(len(frames))

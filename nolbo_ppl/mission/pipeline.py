@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from nolbo_ppl.data.frames import open_frames, write_camera
 from nolbo_ppl.data.observations import read_observations
 from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.errors import input_error
@@ -25,7 +26,15 @@ from nolbo_ppl.io import atomic_path, read_json, read_jsonl, write_json, write_j
 from nolbo_ppl.mission.config import RunConfig
 from nolbo_ppl.mission.crops import best_views, write_crops
 from nolbo_ppl.mission.depth import DepthScale
-from nolbo_ppl.mission.observe import DepthPictures, DepthSource, Observer, StereoPairs, beside, observed_rows
+from nolbo_ppl.mission.observe import (
+    DepthPictures,
+    DepthSource,
+    Observer,
+    SequenceDepth,
+    StereoPairs,
+    beside,
+    observed_rows,
+)
 from nolbo_ppl.mission.scene import build_scene, write_glb
 from nolbo_ppl.mission.sequence import Drive, estimate_or_read, keyframe_rows, open_drive
 from nolbo_ppl.mission.stages import Stage, run_stages
@@ -47,6 +56,7 @@ class Mission:
         check_folders(config)
         self.drive: Drive = open_drive(config)
         self.seconds: dict[str, float] = {}
+        self.cpu_seconds: dict[str, float] = {}
 
     @cached_property
     def model(self) -> ObservationModel:
@@ -86,8 +96,8 @@ class Mission:
         """Odometry of the sequence, its keyframes, the camera, true poses."""
         found = estimate_or_read(self.drive, self.config)
         rows = keyframe_rows(found, self.config)
-        frames, used = self.drive.frames, self.drive.used[rows]
-        write_json(self.out / "intrinsics.json", self.drive.camera())
+        used = self.drive.used[rows]
+        write_camera(self.out / "intrinsics.json", self.drive.camera)
         T, covariance = found.at(rows)
         if covariance is not None:
             with atomic_path(self.out / "odometry_covariance.npz") as temporary:
@@ -95,25 +105,23 @@ class Mission:
         if self.drive.truth is not None:
             write_trajectory(self.out / "truth.txt", Trajectory(self.drive.truth[used]))
         write_trajectory(self.out / "odometry.txt", Trajectory(T))
-        times = frames.times
         write_jsonl(
             self.out / "frames.jsonl",
             (
-                {"frame": k, "image": placed(frames.path(int(i)), self.out), "index": int(i),
-                 "time": None if times is None else float(times[i])}
-                for k, i in enumerate(used)
+                {"frame": k, "image": placed(self.drive.file(i), self.out), "index": i, "time": self.drive.frames.time(i)}
+                for k, i in enumerate(used.tolist())
             ),
         )  # fmt: skip
 
-    def depth_source(self) -> DepthSource | None:
+    def depth_source(self) -> DepthSource:
         """Depth of the keyframes, where there is any."""
         config = self.config
         if config.depth is not None:
             return DepthPictures(beside(config.depth, self.names, self.keyframes.tolist()), DepthScale(config.depth_unit))
         if config.right is not None and config.baseline is not None:
-            right = open_drive(dataclasses.replace(config, images=config.right, truth=None, odometry=None)).frames
+            right = open_frames(config.right)
             return StereoPairs(lambda k: right.frame(int(self.keyframes[k])), float(self.drive.intrinsics[0]), config.baseline)
-        return None
+        return SequenceDepth(self.drive.frames, self.keyframes.tolist())
 
     def observe(self) -> None:
         """The guide on every keyframe."""
@@ -152,7 +160,7 @@ class Mission:
         """summary.json."""
         config = self.config
         summary = summarise(
-            self.out, self.seconds, self.problem, drive=config.truth_objects,
+            self.out, self.seconds, self.cpu_seconds, self.problem, drive=config.truth_objects,
             model=None if config.truth_objects is None else self.model, config=config.slam, loop_gap=config.loop_gap,
             seed=config.seed,
         )  # fmt: skip
@@ -195,7 +203,7 @@ def run_mission(config: RunConfig) -> dict[str, Any]:
         NolboError: an input is missing, malformed, or does not fit the others; complete stages stay.
     """
     mission = Mission(config)
-    run_stages(config.out, mission.stages(), json_of(config), library_versions(), mission.seconds)
+    run_stages(config.out, mission.stages(), json_of(config), library_versions(), mission.seconds, mission.cpu_seconds)
     return read_json(config.out / "summary.json")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from nolbo_ppl.data.frames import FrameSequence, open_frames, read_intrinsics
+from nolbo_ppl.data.frames import CameraIntrinsics, FrameSequence, ImageFolder, open_frames, read_camera, read_lengths
 from nolbo_ppl.data.trajectories import match_times, read_trajectory
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.visual_odometry import (
@@ -34,21 +34,29 @@ class Drive:
 
     frames: FrameSequence
     """All images."""
-    intrinsics: Float[np.ndarray, " 4"]
-    """[fx, fy, cx, cy], px."""
+    camera: CameraIntrinsics
+    """The camera that took them."""
     used: Int[np.ndarray, " u"]
     """Images that are looked at: every so many-th."""
     truth: Poses | None
     """True pose of every image."""
 
-    def camera(self) -> dict[str, Any]:
-        """`intrinsics.json`."""
-        height, width = self.frames.frame(0).shape[:2]
-        return {**dict(zip(("fx", "fy", "cx", "cy"), self.intrinsics.tolist())), "width": width, "height": height}
+    @property
+    def intrinsics(self) -> Float[np.ndarray, " 4"]:
+        """[fx, fy, cx, cy], px."""
+        return self.camera.vector
+
+    def file(self, k: int) -> Path:
+        """The file of an image; of a video, its name inside the video."""
+        if isinstance(self.frames, ImageFolder):
+            return self.frames.files[k]
+        return self.frames.path / self.frames.name(k)
 
     def fingerprint(self) -> Any:
-        """What tells one sequence of images from another."""
-        return [len(self.frames), *(self.frames.name(k) for k in range(len(self.frames)))]
+        """What tells one sequence of images from another: names and sizes of its files."""
+        if isinstance(self.frames, ImageFolder):
+            return [[file.name, file.stat().st_size] for file in self.frames.files]
+        return [len(self.frames), self.frames.path.stat().st_size]
 
 
 @dataclass(frozen=True)
@@ -104,11 +112,12 @@ def open_drive(config: RunConfig) -> Drive:
     """Open images, camera and truth.
 
     Raises:
-        InputError: one of them is missing or malformed, or the truth does not match the images.
+        InputError: one of them is missing or malformed, or they do not fit each other.
     """
     frames = open_frames(config.images)
+    camera = read_camera(config.intrinsics, frames.size)
     truth = None if config.truth is None else poses_of_images(config.truth, len(frames), frames.times)
-    return Drive(frames, read_intrinsics(config.intrinsics), np.arange(0, len(frames), config.every), truth)
+    return Drive(frames, camera, np.arange(0, len(frames), config.every), truth)
 
 
 def scale_of(drive: Drive, config: RunConfig) -> Scale:
@@ -120,25 +129,16 @@ def scale_of(drive: Drive, config: RunConfig) -> Scale:
     if config.camera_height is not None:
         return GroundHeight(config.camera_height, pitch=config.camera_pitch)
     if config.wheel is not None:
-        return KnownLengths(lengths_between(read_lengths(config.wheel, len(drive.frames) - 1), drive.used))
+        return KnownLengths(lengths_between(wheel_lengths(config.wheel, len(drive.frames) - 1), drive.used))
     if drive.truth is not None:
         return KnownLengths(lengths_of(drive.truth[drive.used]))
     raise input_error("visual odometry without a scale", expected="--camera-height, --wheel or --truth",
                       do="or give an odometry of your own with --odometry")  # fmt: skip
 
 
-def read_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
-    """Lengths of the steps between successive images, m, a number a line.
-
-    Raises:
-        InputError: not that many numbers; names the file.
-    """
-    if not path.is_file():
-        raise input_error("no such file", file=path)
-    try:
-        lengths = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
-    except ValueError as error:
-        raise input_error("not a list of lengths", got=error, expected="a number a line, m", file=path) from None
+def wheel_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
+    """Lengths of the steps between successive images, m. Raises `InputError` when there are more or fewer of them."""
+    lengths = read_lengths(path)
     if len(lengths) != count:
         raise input_error("lengths of steps", got=f"{len(lengths)} numbers", expected=f"{count}, one between images", file=path)
     return lengths

@@ -60,6 +60,8 @@ class RunRecord:
     """Versions of what made it."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time of each complete stage."""
+    cpu_seconds: dict[str, float] = field(default_factory=dict)
+    """Processor time of each complete stage."""
     fingerprints: dict[str, str] = field(default_factory=dict)
     """What each complete stage was made from."""
 
@@ -70,6 +72,7 @@ class RunRecord:
             {
                 "configuration": dict(self.configuration), "versions": dict(self.versions),
                 "seconds": {name: round(value, 3) for name, value in self.seconds.items()},
+                "cpu_seconds": {name: round(value, 3) for name, value in self.cpu_seconds.items()},
                 "complete": list(self.fingerprints), "fingerprints": self.fingerprints,
             },
         )  # fmt: skip
@@ -103,7 +106,7 @@ def fingerprints(stages: Sequence[Stage]) -> dict[str, str]:
 
 def run_stages(
     folder: Path, stages: Sequence[Stage], configuration: Mapping[str, Any], versions: Mapping[str, str],
-    seconds: dict[str, float],
+    seconds: dict[str, float], cpu_seconds: dict[str, float],
 ) -> RunRecord:
     """Run what is not there yet, in order; an interrupted stage leaves nothing, and complete ones before it stay.
 
@@ -113,32 +116,35 @@ def run_stages(
         configuration: options, for `run.json`.
         versions: of what does it, for `run.json`.
         seconds: filled with the time of every complete stage as they end, so that later stages can tell it.
+        cpu_seconds: the same, processor time.
 
     Raises:
         InputError: the folder holds something else than a run.
     """
     before = recorded(folder)
     wanted = fingerprints(stages)
-    record = RunRecord(configuration, versions, seconds)
+    record = RunRecord(configuration, versions, seconds, cpu_seconds)
     first = 0
     for stage in stages:
         if before.get("fingerprints", {}).get(stage.name) != wanted[stage.name] or not stage.complete(folder):
             break
         record.fingerprints[stage.name] = wanted[stage.name]
-        record.seconds[stage.name] = float(before.get("seconds", {}).get(stage.name, 0.0))
+        for kept, name in ((record.seconds, "seconds"), (record.cpu_seconds, "cpu_seconds")):
+            kept[stage.name] = float(before.get(name, {}).get(stage.name, 0.0))
         first += 1
     folder.mkdir(parents=True, exist_ok=True)
     record.write(folder)
     for stage in stages[first:]:
         stage.remove(folder)
     for stage in tqdm(stages[first:], desc="stages", unit="stage", disable=None, leave=False):
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         try:
             stage.work()
         except BaseException:
             stage.remove(folder)
             raise
         record.seconds[stage.name] = time.perf_counter() - start
+        record.cpu_seconds[stage.name] = time.process_time() - cpu
         record.fingerprints[stage.name] = wanted[stage.name]
         record.write(folder)
     return record

@@ -164,26 +164,30 @@ def truth_figures(
     return out
 
 
-def time_figures(seconds: Mapping[str, float], keyframes: int) -> dict[str, Any]:
-    """Seconds by stage, images a second through the guide, share of the EM."""
-    total = sum(seconds.values())
-    observe = seconds.get("observe", 0.0)
+def time_figures(seconds: Mapping[str, float], cpu_seconds: Mapping[str, float], keyframes: int) -> dict[str, Any]:
+    """Seconds by stage, by the clock and of the processor; images a second through the guide, share of the EM.
+
+    The share is one of processor time: it does not depend on what else the machine does.
+    """
+    total, observe = sum(cpu_seconds.values()), seconds.get("observe", 0.0)
     return {
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        "cpu_seconds": {name: round(value, 3) for name, value in cpu_seconds.items()},
         "images_per_second": finite(keyframes / observe) if observe > 0 else None,
-        "share_of_em": finite(seconds.get("slam", 0.0) / total) if total > 0 else None,
+        "share_of_em": finite(cpu_seconds.get("slam", 0.0) / total) if total > 0 else None,
     }
 
 
 def summarise(
-    folder: Path, seconds: Mapping[str, float], problem: SlamProblem, *, drive: Path | None, model: ShapeModel | None,
-    config: SlamConfig, loop_gap: int, seed: int,
+    folder: Path, seconds: Mapping[str, float], cpu_seconds: Mapping[str, float], problem: SlamProblem, *,
+    drive: Path | None, model: ShapeModel | None, config: SlamConfig, loop_gap: int, seed: int,
 ) -> dict[str, Any]:
     """Everything `summary.json` holds.
 
     Args:
         folder: the run, complete up to its crops.
         seconds: time of its stages.
+        cpu_seconds: processor time of them.
         problem: what SLAM was given.
         drive: folder of the drive with the true objects, or None.
         model: decodes and encodes shapes, for coverage of latents and shapes by number of views; None leaves them out.
@@ -202,7 +206,7 @@ def summarise(
     if drive is not None:
         truth = read_truth(drive, result.images)
         out |= truth_figures(result, problem, truth, model, config, loop_gap, np.random.default_rng([seed, 3]))
-    return {**out, **time_figures(seconds, len(result.estimate)), "warnings": result.slam.get("warnings", [])}
+    return {**out, **time_figures(seconds, cpu_seconds, len(result.estimate)), "warnings": result.slam.get("warnings", [])}
 
 
 def figure_table(summary: Mapping[str, Any]) -> str:
@@ -240,7 +244,8 @@ def figure_table(summary: Mapping[str, Any]) -> str:
         views = summary["shape"]["iou"]
         rows.append((f"voxel IoU from {', '.join(views)} views", ", ".join(number(value) for value in views.values())))
     rows.append(("images a second through the guide", number(summary["images_per_second"], "{:.1f}")))
-    rows.append(("seconds by stage", ", ".join(f"{name} {value:.1f}" for name, value in summary["seconds"].items())))
+    for key, name in (("seconds", "seconds by stage"), ("cpu_seconds", "  of the processor")):
+        rows.append((name, ", ".join(f"{stage} {value:.1f}" for stage, value in summary[key].items())))
     rows.append(("share of the EM", number(summary["share_of_em"], "{:.2f}")))
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)

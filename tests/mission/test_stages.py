@@ -33,7 +33,7 @@ class Workshop:
     def run(self, **settings: int) -> dict[str, float]:
         self.ran = []
         seconds: dict[str, float] = {}
-        run_stages(self.folder, self.stages(**settings), {"x": 1}, {"v": "2"}, seconds)
+        run_stages(self.folder, self.stages(**settings), {"x": 1}, {"v": "2"}, seconds, {})
         return seconds
 
 
@@ -43,6 +43,7 @@ def test_complete_stages_are_not_done_again(tmp_path: Path) -> None:
     assert shop.ran == ["a", "b", "c"] and list(first) == ["a", "b", "c"]
     record = json.loads((tmp_path / "run" / RECORD).read_text())
     assert record["configuration"] == {"x": 1} and record["versions"] == {"v": "2"} and record["complete"] == ["a", "b", "c"]
+    assert list(record["cpu_seconds"]) == ["a", "b", "c"]
     again = shop.run()
     assert shop.ran == [] and again == pytest.approx(first, abs=1e-3)  # their times are remembered
     shop.run(b=1)
