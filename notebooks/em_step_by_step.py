@@ -125,9 +125,9 @@ right = np.isin(np.arange(before.size).reshape(before.shape), []) | (common[:, N
 print(f"weight on the true landmark, mean over objects: {np.where(right, before, 0).sum(1).mean():.2f}")
 
 # %% [markdown]
-# The diagonal should be bright. But after a lap of drift most true landmarks lie many sensor scales beside their detections: under
-# the sensor's covariance they are no candidates. Started from all tracklets, the EM runs all the same, and its bound, the log
-# posterior, never falls; it climbs to a local maximum that keeps two copies of the street.
+# The diagonal should be bright. But after a lap of drift most true landmarks lie many sensor scales beside their detections:
+# under the sensor's covariance they are no candidates. Started from all tracklets, the EM runs all the same, and its bound, the
+# log posterior, never falls; it climbs to a local maximum that keeps two copies of the street.
 
 # %%
 plain = plain_init(problem, config, state.estimate.T_world_landmark, state.features.latent)
@@ -170,7 +170,8 @@ for axis, number in zip(axes, (0, 1, len(steps))):
     for a, b, w in zip(following.links.a, following.links.b, following.links.weight):
         axis.plot(place[[a, b], 0], place[[a, b], 2], color="#f28e2b", lw=0.5 + 2 * w)
     error = absolute_trajectory_error(now.estimate.T_world_camera, truth).rmse
-    axis.set(aspect="equal", title=f"after {number} step{'s' * (number > 1)}: {error:.2f} m" if number else f"after init: {error:.2f} m")
+    when = f"{number} step{'s' * (number > 1)}" if number else "init"
+    axis.set(aspect="equal", title=f"after {when}: {error:.2f} m")
 axes[0].set(xlabel="x, m", ylabel="z, m");
 
 # %% [markdown]

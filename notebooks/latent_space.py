@@ -46,7 +46,7 @@ categories, dimensions = model.config.categories, model.config.latent_dim
 # %% [markdown]
 # ## What the guide sees
 #
-# Some 280 images of one unseen object each. The guide answers for the object's box; its latent's mean is one point.
+# Some 220 images of one unseen object each. The guide answers for the object's box; its latent's mean is one point.
 
 # %%
 single = dataclasses.replace(
@@ -54,7 +54,7 @@ single = dataclasses.replace(
     truncation_probability=0.0,
 )
 source = SceneSource(single, seed=88_003)
-scenes = [scene for scene in map(source.render, range(280)) if len(scene.labels) == 1]
+scenes = [scene for scene in map(source.render, range(220)) if len(scene.labels) == 1]
 labels = np.array([categories.index(scene.labels[0].category) for scene in scenes])
 answers = model.observe_boxes(
     [scene.image for scene in scenes], np.array([scene.intrinsics for scene in scenes]),

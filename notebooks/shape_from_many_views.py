@@ -150,7 +150,7 @@ figure, axis = plt.subplots(figsize=(10, 2.8), layout="constrained")
 for n, colour in ((1, "#b8c4d6"), (3, "#6f8fc0"), (10, "#1f4e9c")):
     offset = 0.18 * (np.searchsorted((1, 3, 10), n) - 1)
     axis.errorbar(
-        dimension + offset, mean[n - 1], np.sqrt(variance[n - 1]), fmt="o", ms=3, color=colour, label=f"{n} views"
+        dimension + offset, mean[n - 1], np.sqrt(variance[n - 1]), fmt="o", ms=3, color=colour, label=f"{n} view{'s' * (n > 1)}"
     )
 axis.plot(dimension, target[0], color="black", drawstyle="steps-mid", lw=1.2, label="of the true voxels")
 axis.set(xlabel="dimension of the latent", title="fused latent")

@@ -143,8 +143,8 @@ axis.legend(frameon=False, fontsize=8);
 # %% [markdown]
 # ## Are the loops right?
 #
-# A lower error alone proves little. Pairs of detections of one object, more than fifty keyframes apart, are the loops: how many of
-# those the map joins are right (precision), and how many of the true ones it found (recall).
+# A lower error alone proves little. Pairs of detections of one object, more than fifty keyframes apart, are the loops: how many
+# of those the map joins are right (precision), and how many of the true ones it found (recall).
 
 # %%
 found = result.associations
