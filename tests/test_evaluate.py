@@ -490,12 +490,14 @@ def test_the_verb_writes_figures_and_pictures(scene_folder, tmp_path, capsys):
     save(tmp_path / "model", model, Calibration(), {})
     out = tmp_path / "out"
     arguments = f"--model {tmp_path / 'model'} --scenes {scene_folder} --count 6 --out {out} --resamples 20"
-    evaluate.main([*arguments.split(), "--threshold", "0.002"])
+    evaluate.main([*arguments.split(), "--threshold", "0.002", "--retrieval", "--gallery", "2", "--sizes", "64", "128"])
     values = json.loads((out / "metrics.json").read_text())
     assert set(REQUIRED) <= set(values) and values["scenes"] == 6
     assert values["configuration"]["scenes"] == str(scene_folder) and values["seeds"]["scenes"] is None
-    for name in ("precision_recall", "reliability", "confusion", "viewpoint", "examples"):
+    for name in ("precision_recall", "reliability", "confusion", "viewpoint", "retrieval", "examples", "detections"):
         assert (out / f"{name}.png").stat().st_size > 5000
+    assert (out / "index.html").read_text().count("data:image/") == 7
+    assert values["retrieval"]["car"]["instances"] == 2 and 0 <= values["retrieval_recall1"] <= 1
     assert "ap50" in capsys.readouterr().out
 
 
