@@ -58,7 +58,7 @@ class RunFolder:
     associations: RunAssociations | None = None
     iterations: Iterations | None = None
     objects: dict[str, str | None] | None = None
-    """True object of each detection by its id, None for clutter; None when nobody said."""
+    """True object of each detection by its id, None for clutter; others are not known. None when nobody said anything."""
     run: dict[str, Any] = field(default_factory=dict)
     """`run.json`."""
     summary: dict[str, Any] = field(default_factory=dict)
@@ -199,12 +199,17 @@ def _frame_of(path: Path | None) -> dict[str, int] | None:
 
 
 def _objects(path: Path) -> dict[str, str | None] | None:
-    """True object of each detection from `objects.json` as converters write it; other files of that name say nothing."""
-    if not path.is_file():
+    """True object of each detection from `objects.json` as converters write it, without the rows whose truth is not
+    trusted; other files of that name say nothing.
+    """
+    value = read_json(path) if path.is_file() else None
+    value = value if isinstance(value, dict) else {}
+    found = value.get("objects")
+    if not isinstance(found, dict):
         return None
-    value = read_json(path)
-    value = value.get("objects") if isinstance(value, dict) else None
-    return {str(k): None if v is None else str(v) for k, v in value.items()} if isinstance(value, dict) else None
+    trusted = value.get("trusted")
+    kept = trusted if isinstance(trusted, list) and len(trusted) == len(found) else [True] * len(found)
+    return {str(k): None if v is None else str(v) for (k, v), keep in zip(found.items(), kept) if keep}
 
 
 def read_run(

@@ -59,7 +59,8 @@ def headline(run: RunFolder) -> str:
         tiles.append(("Loop recall", say(scores["recall"], 3), f"of {say(scores['true'], 3)} true pairs"))
     sure = sum(x.existence is None or x.existence >= 0.5 for x in run.landmarks)
     truth = _find(run.summary, "map", "objects_detected")
-    note = f"{len(run.categories)} categories" if truth is None else f"{truth:.0f} objects seen often enough"
+    kinds = f"{len(run.categories)} categor{'y' if len(run.categories) == 1 else 'ies'}"
+    note = kinds if truth is None else f"{truth:.0f} objects seen often enough"
     tiles.append(("Landmarks", str(sure), note))
     length = path_length(run.estimate)
     tiles.append(("Keyframes", str(len(run)), f"{say(length, 3)} m of way"))

@@ -14,7 +14,7 @@ from nolbo_ppl.viz.report.shapes import data_uri
 from nolbo_ppl.viz.report.svg import element, escape
 from nolbo_ppl.viz.style import MUTED
 
-MOST_COLUMNS = 1600
+MOST_COLUMNS = 1000
 """More observations than this share columns; the largest weight of those that share one is shown."""
 MOST_ROWS = 900
 """More landmarks than this share rows."""

@@ -52,11 +52,13 @@ def find_loops(found: RunAssociations, gap: int) -> list[Loop]:
 
 
 def object_labels(run: RunFolder) -> Int[np.ndarray, " k"] | None:
-    """Number of the true object of each detection, -1 for none; None when truth does not say."""
+    """Number of the true object of each detection, -1 for none, -2 where it is not known; None when nobody said anything."""
     if run.objects is None or run.associations is None:
         return None
-    names = {name: i for i, name in enumerate(dict.fromkeys(name for name in run.objects.values() if name is not None))}
-    return np.array([-1 if (name := run.objects.get(i)) is None else names[name] for i in run.associations.id], dtype=np.int64)
+    number: dict[str | None, int] = {None: -1}
+    for name in run.objects.values():
+        number.setdefault(name, len(number) - 1)
+    return np.array([number[run.objects[i]] if i in run.objects else -2 for i in run.associations.id], dtype=np.int64)
 
 
 def is_right(run: RunFolder, loop: Loop) -> bool | None:
@@ -67,7 +69,9 @@ def is_right(run: RunFolder, loop: Loop) -> bool | None:
         return None
     mine = found.landmark_of == loop.landmark
     before, after = set(label[mine & (found.frame == loop.before)]), set(label[mine & (found.frame == loop.after)])
-    return bool((before & after) - {-1})
+    if before == {-2} or after == {-2}:
+        return None
+    return bool((before & after) - {-1, -2})
 
 
 def loop_scores(run: RunFolder) -> dict[str, float | None] | None:
@@ -79,5 +83,6 @@ def loop_scores(run: RunFolder) -> dict[str, float | None] | None:
     label, found = object_labels(run), run.associations
     if label is None or found is None or found.frame is None:
         return None
-    score = association_pairs(found.frame, label, found.landmark_of, loop_gap(run))
+    known = label > -2
+    score = association_pairs(found.frame[known], label[known], found.landmark_of[known], loop_gap(run))
     return {"precision": score.precision, "recall": score.recall, "found": score.found_pairs, "true": score.true_pairs}

@@ -105,6 +105,7 @@ def colour_of(run: RunFolder, landmark: RunLandmark) -> str:
 def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
     """Every landmark: its 95 % ellipse and its place, in the colour of its category."""
     index, parts = list(run.plane), []
+    radius = 4 if len(run.landmarks) <= 60 else 2.8 if len(run.landmarks) <= 300 else 2
     for k, landmark in enumerate(run.landmarks):
         colour, xy = colour_of(run, landmark), landmark.position[index]
         mark = ""
@@ -116,7 +117,7 @@ def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
             "circle",
             cx=number(float(axes.px(xy[0]))),
             cy=number(float(axes.py(xy[1]))),
-            r=4,
+            r=radius,
             class_="dot weak" if weak else "dot",
             style=f"fill:{colour};stroke:{colour}",
         )

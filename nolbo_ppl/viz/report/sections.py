@@ -93,6 +93,8 @@ def loop_closures(run: RunFolder) -> str:
         return element("p", missing, class_="note")
     gap = loop_gap(run)
     loops = find_loops(run.associations, gap)
+    if not loops:
+        return element("p", f"No landmark was seen again after more than {gap} keyframes.", class_="note")
     scores, said = loop_scores(run), ""
     if scores is not None:
         said = f" Pairs of detections: precision {say(scores['precision'])}, recall {say(scores['recall'])}."

@@ -24,6 +24,8 @@ WAYS: tuple[tuple[str, str, Rgb], ...] = (
 """Trajectories: attribute of the run, name, colour."""
 MOST_CAMERAS = 60
 """Cameras drawn along the way; the slider reaches all."""
+MOST_LABELS = 40
+"""More names than this cover the scene: they are hidden until asked for."""
 THUMBNAIL, PICTURE = 160, 640
 """Longer sides, px, of the pictures in the cameras along the way and at the slider."""
 
@@ -274,5 +276,5 @@ def build_viewer(run_dir: str | PathLike[str] | RunFolder, server: ViserServer) 
     add_iterations(viewer, server)
     add_cameras(viewer, server)
     add_objects(viewer.add, run, server)
-    add_switches(viewer, server, hidden=("em",))
+    add_switches(viewer, server, hidden=("em", "labels") if len(run.landmarks) > MOST_LABELS else ("em",))
     return viewer

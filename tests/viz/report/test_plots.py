@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.geometry.voxels import voxel_centres
+from nolbo_ppl.io import read_json, write_json
 from nolbo_ppl.viz.report import read_run
 from nolbo_ppl.viz.report.em import json_script
 from nolbo_ppl.viz.report.landmarks import RunAssociations
@@ -145,3 +147,18 @@ def test_numbers_are_said_shortly() -> None:
     assert [say(x) for x in (None, float("nan"), 0.0, 3, 0.123456, 1234.6, 1e-7, True)] == [
         "–", "–", "0", "3", "0.1235", "1235", "1e-07", "yes",
     ]  # fmt: skip
+
+
+def test_detections_whose_truth_is_not_trusted_are_not_judged(run_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(run_folder, tmp_path / "run")
+    before = loop_scores(read_run(run_folder))
+    truth = read_json(run_folder / "objects.json")["objects"]
+    # A wrong truth of every third detection spoils the precision; set aside as not trusted, it does not.
+    wrong = {name: f"other {k}" if k % 3 == 0 else thing for k, (name, thing) in enumerate(truth.items())}
+    write_json(tmp_path / "run" / "objects.json", {"objects": wrong})
+    spoilt = loop_scores(read_run(tmp_path / "run"))
+    write_json(tmp_path / "run" / "objects.json", {"objects": wrong, "trusted": [k % 3 != 0 for k in range(len(wrong))]})
+    after = loop_scores(read_run(tmp_path / "run"))
+    assert before is not None and spoilt is not None and after is not None
+    assert before["precision"] == after["precision"] == 1.0 and spoilt["precision"] < 0.7  # type: ignore[operator]
+    assert after["found"] < before["found"]  # type: ignore[operator]
