@@ -119,7 +119,7 @@ print(f"it reconstructs unseen shapes with a voxel IoU of {float(iou):.2f}")
 # ## Both spaces in two dimensions
 #
 # t-SNE keeps neighbours together. The guide's means share their map with samples of the prior, $z \sim N(\mu_\psi(l), I)$:
-# where the story says a category lies, its images must land. Large marks are the prior means.
+# where the story says a category lies, its images must land. Rings are the prior means.
 
 # %%
 rng = np.random.default_rng(0)
@@ -146,8 +146,8 @@ for axis, (title, place, label) in zip(axes, maps):
         axis.scatter(*place[own].T, s=9, color=category_colour(category), label=category)
     if title.startswith("NOLBO"):
         for number, category in enumerate(categories):
-            axis.scatter(*shared[len(guide) + len(prior) + number], s=90, marker="X", color=category_colour(category), ec="k")
-        axis.set(xlim=axes[2].get_xlim() if axis is axes[2] else None)
+            place_of_mean = shared[len(guide) + len(prior) + number]
+            axis.scatter(*place_of_mean, s=330, facecolor="none", edgecolor=category_colour(category), lw=1.2)
     axis.set(title=title, xticks=[], yticks=[])
 for axis in axes[1:]:
     low, high = shared.min(0) - 3, shared.max(0) + 3
@@ -212,8 +212,8 @@ figure.text(0.5, 0.46, "plain autoencoder, drawn from one Gaussian about its lat
 # %% [markdown]
 # ## Between two categories
 #
-# On the straight line from one prior mean to another the decoder passes a region that no category claims. Its shapes
-# fade rather than morph, and the class posterior (bars) says how fast the story changes its mind.
+# On the straight line from one prior mean to another the decoder passes a region that no category claims. The shapes are
+# coloured by the likelier category; the class posterior (bars) says how fast the story changes its mind.
 
 # %%
 start, end = categories.index("chair"), categories.index("sofa")
