@@ -6,9 +6,9 @@ import pytest
 
 from nolbo_ppl.data.drive import DriveConfig, World, make_world
 
-STREET = DriveConfig(frames=40, step=3.0, laps=1.3, objects=40, clutter=12, size=(160, 96), supersample=1, seed=5)
+STREET = DriveConfig(frames=40, step=3.0, laps=1.3, objects=90, clutter=12, size=(160, 96), supersample=1, seed=5)
 INDOOR = DriveConfig(
-    world="indoor", frames=40, step=1.0, laps=1.3, objects=30, clutter=8, size=(160, 96), supersample=1, seed=6
+    world="indoor", frames=40, step=1.0, laps=1.3, objects=50, clutter=8, size=(160, 96), supersample=1, seed=6
 )
 
 
