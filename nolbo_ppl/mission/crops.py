@@ -14,7 +14,7 @@ from nolbo_ppl.io import atomic_path
 
 MARGIN = 0.15
 """What is shown around the box, as a share of its sides."""
-LONGEST = 256
+LONGEST = 192
 """Longer side of a crop, px; smaller ones are enlarged to it up to four times."""
 
 

@@ -156,17 +156,20 @@ def coverage_figures(
 def loop_figures(
     frame: Int[np.ndarray, " k"], object_of: Int[np.ndarray, " k"], landmark_of: Int[np.ndarray, " k"], gap: int
 ) -> dict[str, Any]:
-    """Precision and recall over pairs of detections more than `gap` frames apart; wrong where one is of no object.
+    """Precision and recall over pairs of detections more than `gap` frames apart.
 
-    `precision_of_objects` looks only at detections of true objects: what nobody labelled has no truth to be held against.
+    A found pair is right when both detections are of one object and wrong when only one is of an object, or both are of
+    different ones. Two detections of things nobody labelled (a manhole taken for a table twice) have no truth to be held
+    against: `precision` leaves them out, `precision_strict` counts them as wrong.
     """
     score = association_pairs(frame, object_of, landmark_of, gap)
-    known = object_of >= 0
-    of_objects = association_pairs(frame[known], object_of[known], landmark_of[known], gap)
+    unknown = object_of < 0
+    unjudged = association_pairs(frame[unknown], object_of[unknown], landmark_of[unknown], gap).found_pairs
+    judged = score.found_pairs - unjudged
     return {
-        "gap_frames": gap, "true_pairs": score.true_pairs, "found_pairs": score.found_pairs,
-        "precision": finite(score.precision) if score.found_pairs else None,
-        "precision_of_objects": finite(of_objects.precision) if of_objects.found_pairs else None,
+        "gap_frames": gap, "true_pairs": score.true_pairs, "found_pairs": score.found_pairs, "unlabelled_pairs": unjudged,
+        "precision": finite(score.correct_pairs / judged) if judged else None,
+        "precision_strict": finite(score.precision) if score.found_pairs else None,
         "recall": finite(score.recall) if score.true_pairs else None,
     }  # fmt: skip
 

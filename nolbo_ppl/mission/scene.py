@@ -20,10 +20,17 @@ if TYPE_CHECKING:
 
 LEAST_EXISTENCE = 0.5
 """Landmarks that are more likely background are left out."""
+LEAST_DETECTIONS = 0.5
+"""So are those that in the end no detection is put on."""
 PATH_COLOUR = "#2f6fde"
 """The camera's path."""
 T_GLTF_WORLD = np.diag([1.0, -1.0, -1.0, 1.0])
 """glTF has y up; the world of a run has x right, y down, z forward."""
+
+
+def stands(row: Mapping[str, Any]) -> bool:
+    """Whether a row of `landmarks.json` is part of the map: more likely an object than not, and with detections."""
+    return row["existence"] >= LEAST_EXISTENCE and row.get("detections", 1.0) >= LEAST_DETECTIONS
 
 
 def landmark_pose(row: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
@@ -70,7 +77,7 @@ def build_scene(
     categories = sorted({str(row["category"]) for row in landmarks if row.get("category")})
     materials: dict[str, PBRMaterial] = {}
     for row in landmarks:
-        if row["name"] not in voxels or row["existence"] < LEAST_EXISTENCE:
+        if row["name"] not in voxels or not stands(row):
             continue
         vertices, faces = landmark_mesh(row, np.asarray(voxels[row["name"]], dtype=np.float64))
         if not len(faces):

@@ -29,7 +29,7 @@ from nolbo_ppl.mission.figures import (
     position_figures,
     shape_figures,
 )
-from nolbo_ppl.mission.scene import LEAST_EXISTENCE
+from nolbo_ppl.mission.scene import stands
 from nolbo_ppl.mission.truth import DriveTruth, Matched, match_detections, read_truth
 
 ASSOCIATION_IOU = 0.3
@@ -65,8 +65,8 @@ class RunResult:
 
     @property
     def exists(self) -> np.ndarray:
-        """Landmarks that are more likely objects than background."""
-        return np.array([row["existence"] >= LEAST_EXISTENCE for row in self.landmarks], dtype=bool)
+        """Landmarks that are part of the map."""
+        return np.array([stands(row) for row in self.landmarks], dtype=bool)
 
 
 def read_covariance(path: Path) -> Float[np.ndarray, "n-1 6 6"] | None:

@@ -61,12 +61,13 @@ def test_loop_pairs_by_enumeration() -> None:
     far = [(i, j) for i, j in itertools.combinations(range(80), 2) if abs(frame[i] - frame[j]) > 50]
     true = {(i, j) for i, j in far if object_of[i] == object_of[j] >= 0}
     found = {(i, j) for i, j in far if landmark_of[i] == landmark_of[j] >= 0}
-    known = {(i, j) for i, j in found if object_of[i] >= 0 and object_of[j] >= 0}
+    judged = {(i, j) for i, j in found if object_of[i] >= 0 or object_of[j] >= 0}
     figures = loop_figures(frame, object_of, landmark_of, 50)
     assert (figures["true_pairs"], figures["found_pairs"]) == (len(true), len(found))
     assert figures["recall"] == pytest.approx(len(true & found) / len(true), abs=1e-6)
-    assert figures["precision"] == pytest.approx(len(true & found) / len(found), abs=1e-6)
-    assert figures["precision_of_objects"] == pytest.approx(len(true & found) / len(known), abs=1e-6)
+    assert figures["precision_strict"] == pytest.approx(len(true & found) / len(found), abs=1e-6)
+    assert figures["precision"] == pytest.approx(len(true & found) / len(judged), abs=1e-6)
+    assert figures["unlabelled_pairs"] == len(found) - len(judged) > 0
     nothing = loop_figures(frame, object_of, np.full(80, -1), 50)
     assert nothing["precision"] is None and nothing["recall"] == 0.0
 

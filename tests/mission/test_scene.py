@@ -42,8 +42,10 @@ def test_a_landmark_without_orientation_stands_upright() -> None:
 
 
 def test_the_file_can_be_read_back(tmp_path: Path) -> None:
-    landmarks = [row(), row("L1", position=[-2.0, 0.0, 4.0], category="chair"), row("L2", existence=0.1), row("L3")]
-    voxels = {"L0": slab(), "L1": 0.3 * slab(), "L2": slab()}  # L1 is nowhere sure, L2 hardly exists, L3 has no shape
+    landmarks = [row(), row("L1", position=[-2.0, 0.0, 4.0], category="chair"), row("L2", existence=0.1), row("L3"),
+                 row("L4", detections=0.0)]  # fmt: skip
+    voxels = {"L0": slab(), "L1": 0.3 * slab(), "L2": slab(), "L4": slab()}
+    # L1 is nowhere sure, L2 hardly exists, L3 has no shape, L4 no detection.
     path = make_pose(np.tile(np.eye(3), (4, 1, 1)), np.array([[0, 0, z] for z in range(4)], dtype=float))
     write_glb(tmp_path / "map.glb", build_scene(landmarks, voxels, path))
     scene = trimesh.load_scene(tmp_path / "map.glb")
@@ -93,7 +95,8 @@ def test_a_crop_shows_the_box_with_a_margin() -> None:
     image = np.zeros((100, 200, 3), dtype=np.uint8)
     image[40:60, 80:120] = 255
     part = cut(image, np.array([80.0, 40.0, 120.0, 60.0]))
-    assert part.shape == (4 * 26, 4 * 52, 3)  # 15 % of 40 x 20 px on each side, four times
-    assert (part[52, 104] == 255).all() and (part[2, 2] == 0).all()
+    assert part.shape == (LONGEST // 2, LONGEST, 3)  # 40 x 20 px with 15 % on each side, enlarged
+    assert (part[48, 96] == 255).all() and (part[2, 2] == 0).all()
+    assert cut(image, np.array([80.0, 40.0, 100.0, 60.0])).shape == (4 * 26, 4 * 26, 3)  # no more than four times
     assert max(cut(image, np.array([-5.0, -5.0, 205.0, 105.0])).shape) == LONGEST
     assert min(cut(image, np.array([199.9, 99.9, 200.0, 100.0])).shape) >= 1
