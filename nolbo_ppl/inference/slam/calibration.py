@@ -22,9 +22,11 @@ CLIP = 3.0
 """Whitened residuals are clipped here before they are correlated."""
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
-UNSTATED_FACTOR, UNSTATED_RANGE_FACTOR, UNSTATED_ROTATION_FACTOR = 4.0, 16.0, 16.0
-"""Least factors where nobody stated a scale: detectors are biased by view, most of all in depth and orientation, which
-residuals about one track do not show."""
+UNSTATED_FACTOR, UNSTATED_ROTATION_FACTOR = 4.0, 16.0
+"""Least factors where nobody stated a scale: detectors are biased by view, most of all in orientation, which residuals about
+one track do not show."""
+POOR_DEPTH = 1.5
+"""Depth this many times as noisy as directions is that of a camera: then it is biased as well, and its factor grows."""
 LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
@@ -54,6 +56,14 @@ def _width(whitened: np.ndarray, count: np.ndarray) -> float:
     return robust_scale((whitened[use] / np.sqrt(1 - 1 / count[use])[:, None]).ravel())
 
 
+def unstated_range_factor(report: dict[str, float], distance: float) -> float:
+    """Least factor along the ray: as across it where depth is as good as directions, up to four times that where it is not."""
+    if "position_radial" not in report:
+        return UNSTATED_FACTOR
+    lateral, radial = (report[f"position_{k}"] + report[f"position_{k}_ratio"] * distance for k in ("lateral", "radial"))
+    return UNSTATED_FACTOR * float(np.clip((radial / max(lateral, 1e-12) / POOR_DEPTH) ** 2, 1.0, 4.0))
+
+
 def calibrate(state: SlamState) -> SlamState:
     """Widen position and rotation scales to the residuals about the solved tracks, and account for their correlation.
 
@@ -63,8 +73,8 @@ def calibrate(state: SlamState) -> SlamState:
     noise, config = state.noise, state.config
     if len(rows) < LEAST_DETECTIONS:
         if not np.isfinite(table.position_covariance[rows]).any():
-            noise = replace(noise, position_factor=UNSTATED_FACTOR, range_factor=UNSTATED_RANGE_FACTOR,
-                            rotation_factor=UNSTATED_ROTATION_FACTOR)
+            along = unstated_range_factor(noise.report, state.typical_range)
+            noise = replace(noise, position_factor=UNSTATED_FACTOR, range_factor=along, rotation_factor=UNSTATED_ROTATION_FACTOR)
         return replace(state, noise=noise)
     frame = table.frame[rows]
     count = np.bincount(state.landmark, minlength=len(state.static))[state.landmark].astype(np.float64)
@@ -79,7 +89,8 @@ def calibrate(state: SlamState) -> SlamState:
     factor = np.where(stated, _stated_factor(ratio, "position", stated[rows], config.correct_scales, warnings),
                       np.nan_to_num(max(ratio, 1.0), nan=1.0))
     report["position_track_width"] = ratio
-    across, along = (1.0, 1.0) if stated[rows].any() else (UNSTATED_FACTOR, UNSTATED_RANGE_FACTOR)
+    across, along = (1.0, 1.0) if stated[rows].any() else (
+        UNSTATED_FACTOR, unstated_range_factor(noise.report, state.typical_range))
     report["position_correlation_factor"] = position_factor = correlation_factor(z, state.landmark, frame)
     noise = replace(noise, position_covariance=noise.position_covariance * (factor**2)[:, None, None],
                     position_factor=max(position_factor, across), range_factor=max(position_factor, along))

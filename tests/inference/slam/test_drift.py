@@ -7,6 +7,7 @@ import pytest
 
 from nolbo_ppl.geometry.pose import se3_exp, skew
 from nolbo_ppl.inference.slam import drift
+from nolbo_ppl.inference.slam.calibration import unstated_range_factor
 from nolbo_ppl.inference.slam.drift import DriftGraph
 from nolbo_ppl.inference.slam.graph import widened
 
@@ -83,3 +84,11 @@ def test_covariances_widen_along_and_across_the_ray() -> None:
     position = np.array([[0.0, 0.0, 4.0], [3.0, 0.0, 0.0]])
     wide = widened(np.tile(np.eye(3), (2, 1, 1)), position, 4.0, 9.0)
     np.testing.assert_allclose(wide, [np.diag([4.0, 4.0, 9.0]), np.diag([9.0, 4.0, 4.0])], atol=1e-12)
+
+
+def test_depth_of_cameras_is_trusted_less_than_that_of_lidar() -> None:
+    scales = {"position_lateral": 0.01, "position_lateral_ratio": 0.001, "position_radial_ratio": 0.001}
+    assert unstated_range_factor({**scales, "position_radial": 0.01}, 10.0) == 4.0
+    assert unstated_range_factor({**scales, "position_radial": 0.05}, 10.0) == pytest.approx(4.0 * 4.0)
+    assert 4.0 < unstated_range_factor({**scales, "position_radial": 0.03}, 10.0) < 16.0
+    assert unstated_range_factor({}, 10.0) == 4.0
