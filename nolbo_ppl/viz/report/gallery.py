@@ -24,7 +24,7 @@ def order(run: RunFolder) -> list[int]:
 
 
 def _image(uri: str, alt: str, caption: str, empty: str = "") -> str:
-    inside = f'<img src="{uri}" alt="{escape(alt)}" loading="lazy">' if uri else element("div", escape(empty), class_="missing")
+    inside = f'<img src="{uri}" alt="{escape(alt)}">' if uri else element("div", escape(empty), class_="missing")
     return element("figure", inside + element("figcaption", escape(caption)))
 
 

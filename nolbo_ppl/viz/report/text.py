@@ -25,12 +25,13 @@ UNITS = {
     "median_rotation_error_deg": "median rotation error, °",
     "share_of_em": "share of EM in the time",
     "gap_frames": "gap, keyframes",
-    "map": "map against the truth",
-    "loops": "loop pairs",
-    "shape": "shapes",
-    "observation_figures": "observations against the truth",
 }
 """Figures whose name alone would not say what they are."""
+TITLES = {
+    "map": "Map against the truth", "loops": "Loop pairs", "shape": "Shapes",
+    "observation_figures": "Observations against the truth",
+}  # fmt: skip
+"""Parts of a summary whose name alone would not say what they are."""
 SETTINGS = ("configuration", "versions", "iterations", "warnings", "noise", "fingerprints", "complete")
 """Parts of a summary that are not figures."""
 
@@ -100,7 +101,7 @@ def figures_tables(values: Mapping[str, Any], title: str = "Counts") -> list[tup
     for key, value in values.items():
         if key in SETTINGS or key in errors or not isinstance(value, Mapping) or not value:
             continue
-        name = title_of(key)[:1].upper() + title_of(key)[1:]
+        name = TITLES.get(key, title_of(key)[:1].upper() + title_of(key)[1:])
         if len(value) > 1 and all(isinstance(member, Mapping) for member in value.values()):
             out.append((name, _columns(value)))
         else:
