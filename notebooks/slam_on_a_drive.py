@@ -72,7 +72,7 @@ else:
     corners = np.array([(0, 0), (0, 120), (70, 120), (70, 60), (150, 60), (150, 0)], dtype=float)
     truth = streets(np.concatenate((corners, corners, corners[:3])))[: int(1.5 * 540 / 2)]
 
-rng = np.random.default_rng(7)
+rng = np.random.default_rng(9)
 drive = simulate_drive(
     truth, rng, world=WorldConfig(objects=160, categories=8, instance_scale=0.8, lateral=(4.0, 10.0)),
     detector=DetectorConfig(maximum_range=20.0, clutter_rate=0.3), odometry_rotation_scale=0.006,
@@ -170,7 +170,8 @@ axis.legend(frameon=False, fontsize=8, markerscale=2);
 # ## Are the uncertainties right?
 #
 # For each landmark with a true object: squared error over claimed covariance, by degree of freedom, in the frame of the first
-# camera, which both hold fixed. It is 1 on average when covariances are right, and more when they are too small.
+# camera, which both hold fixed. It is 1 on average when covariances are right, and more when they are too small. Mind that all
+# landmarks share the camera's drift: one drive is a few draws of it, not a hundred. Average over drives before you conclude.
 
 # %%
 object_of_landmark = np.full(len(result.landmarks), -1)
@@ -191,9 +192,8 @@ axes[0].hist(np.clip(nees, 0, 5), 30, color=OWN)
 axes[0].axvline(1, color="black", lw=0.8)
 axes[0].set(title=f"squared error over covariance, mean {nees.mean():.2f}", xlabel="by degree of freedom")
 size = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-axes[1].loglog(size, np.linalg.norm(error, axis=1), ".", color=OWN)
-low, high = size.min(), size.max()
-axes[1].plot([low, high], [low, high], color="black", lw=0.8)
+axes[1].plot(size, np.linalg.norm(error, axis=1), ".", color=OWN)
+axes[1].plot([0, size.max()], [0, size.max()], color="black", lw=0.8)
 axes[1].set(xlabel="claimed standard deviation, m", ylabel="actual error, m", title="landmarks");
 
 # %% [markdown]
