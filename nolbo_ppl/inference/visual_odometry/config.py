@@ -32,7 +32,7 @@ class OdometryConfig:
     """Settings of the visual odometry. The defaults are tuned on images of 384 x 192 px and hold for larger ones."""
 
     detector: Literal["orb", "sift"] = "orb"
-    """Features: ORB is faster, SIFT more accurate (docs: `nolbo odometry`)."""
+    """Features: ORB is faster, SIFT more accurate and three times slower."""
     features: int = 700
     """Features an image, at most."""
     fast_threshold: int = 5

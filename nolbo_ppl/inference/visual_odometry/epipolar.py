@@ -21,6 +21,8 @@ GATE = 4.0
 """Residuals beyond this many standard deviations are no inliers."""
 LEAST_SCALE = 0.02
 """Least standard deviation of a corner, px: synthetic images can fit to rounding."""
+LEVERAGE = 3.0
+"""A match pulls at the direction of translation at most so many times as much as the usual one."""
 MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 
@@ -106,6 +108,17 @@ def student_weights(residual: Float[np.ndarray, " m"], scale: float) -> Float[np
     return (FREEDOM + 1.0) / (FREEDOM + (residual / scale) ** 2)
 
 
+def leverage_weights(jacobian: Float[np.ndarray, "m 5"], inside: Bool[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Weights that bound the pull of single matches (Mallows 1975).
+
+    A wrong match seems to lie right before the camera; with twenty times the parallax of the others it turns the
+    translation until its residual is small, and no loss on residuals alone gets rid of it.
+    """
+    pull = np.linalg.norm(jacobian[:, 3:], axis=1)
+    largest = LEVERAGE * float(np.median(pull[inside])) if inside.any() else np.inf
+    return np.minimum(1.0, largest / np.maximum(pull, 1e-12)) ** 2
+
+
 def robust_cost(residual: Float[np.ndarray, " m"], threshold: float) -> float:
     """Mean of Geman and McClure's bounded loss, for comparing two motions on the same matches."""
     square = (residual / threshold) ** 2
@@ -127,7 +140,7 @@ def refine(
         if inside.sum() < 8:
             break
         scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE)
-        weight = np.where(inside, student_weights(residual, scale), 0.0)
+        weight = np.where(inside, student_weights(residual, scale), 0.0) * leverage_weights(jacobian, inside)
         normal = (jacobian * weight[:, None]).T @ jacobian
         # Along a direction nobody measures the step must stay small, not blow up.
         step = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), jacobian.T @ (weight * residual))
@@ -141,16 +154,16 @@ def refine(
             break
     inside = np.abs(residual) < limit
     scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE) if inside.any() else threshold
-    covariance = sampson_covariance(residual[inside], jacobian[inside], scale)
+    weight = leverage_weights(jacobian, inside)[inside]
+    covariance = sampson_covariance(residual[inside], jacobian[inside], weight, scale)
     return TwoView(R, direction, covariance, inside, scale, robust_cost(residual, threshold))
 
 
 def sampson_covariance(
-    residual: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m 5"], scale: float
+    residual: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m 5"], weight: Float[np.ndarray, " m"], scale: float
 ) -> Float[np.ndarray, "5 5"]:
-    """Covariance of the robust estimate, `(J'J)^-1 sum psi^2 / (m - 5) / mean(psi')^2` (Huber 1981, eq. 7.6.5).
-
-    Fewer than six residuals say nothing: a unit matrix.
+    """Covariance of the robust estimate, `s (J'WJ)^-1 J'W^2J (J'WJ)^-1` with `s = sum psi^2 / (m - 5) / mean(psi')^2`
+    (Huber 1981, eq. 7.6.5, with weights W of the leverage). Fewer than six residuals say nothing: a unit matrix.
     """
     if len(residual) < 6:
         return np.eye(5)
@@ -158,9 +171,10 @@ def sampson_covariance(
     psi = student_weights(residual, scale) * residual
     slope = np.mean((FREEDOM + 1.0) * (FREEDOM - square) / (FREEDOM + square) ** 2)
     variance = np.sum(psi**2) / (len(residual) - 5) / slope**2
-    information = jacobian.T @ jacobian
-    # The floor is one direction unobserved altogether: a standard deviation of about a radian there.
-    return variance * np.linalg.inv(information + variance * np.eye(5))
+    weighted = jacobian * weight[:, None]
+    # Along a direction nobody measures the standard deviation is about a radian.
+    bread = np.linalg.inv(weighted.T @ jacobian + variance * np.eye(5))
+    return variance * bread @ (weighted.T @ weighted + variance * np.eye(5)) @ bread
 
 
 def essential_by_consensus(

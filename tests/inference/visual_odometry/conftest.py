@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nolbo_ppl.geometry.pose import chain, se3_exp
+from nolbo_ppl.geometry.pose import make_pose, so3_exp
 
 INTRINSICS = np.array([200.0, 200.0, 192.0, 96.0])
 HEIGHT, WIDTH = 192, 384
@@ -72,16 +72,16 @@ def make_room(T_world_camera: np.ndarray, seed: int = 0) -> Room:
 
 
 def weaving(steps: int, length: float, turn: float) -> np.ndarray:
-    """A path forward that weaves left and right and nods a little."""
-    twists = np.zeros((steps, 6))
-    phase = np.arange(steps) * 2 * np.pi / 16
-    twists[:, 1], twists[:, 0], twists[:, 5] = turn * np.cos(phase), 0.1 * turn * np.sin(phase), length
-    twists[:, 3] = 0.05 * length * np.sin(phase)
-    start = np.eye(4)
-    start[2, 3] = -15.0
-    return chain(start, se3_exp(twists))
+    """A level path forward that weaves left and right; the camera nods a little."""
+    phase = np.arange(steps + 1) * 2 * np.pi / 16
+    heading, nod = 2.5 * turn * np.sin(phase), 0.15 * turn * np.sin(2.3 * phase)
+    zero = np.zeros_like(phase)
+    ways = length * np.column_stack([np.sin(heading), zero, np.cos(heading)])[:-1]
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum(ways, axis=0)]) + [0, 0, -15]
+    yaw, pitch = (so3_exp(np.column_stack(axes)) for axes in ((zero, heading, zero), (nod, zero, zero)))
+    return make_pose(yaw @ pitch, position)
 
 
 @pytest.fixture(scope="session")
 def room() -> Room:
-    return make_room(weaving(40, 0.4, 0.03))
+    return make_room(weaving(39, 0.4, 0.03))
