@@ -25,16 +25,9 @@ from nolbo_ppl.inference.pyramid import Pyramid
 from nolbo_ppl.inference.queries import ObservationModel
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import write_json
-from nolbo_ppl.metrics.figures import (
-    DetectionRecords,
-    ObjectRecords,
-    category_table,
-    concatenate,
-    confusion,
-    difficulty_table,
-    figures,
-)
+from nolbo_ppl.metrics.figures import category_table, confusion, difficulty_table, figures
 from nolbo_ppl.metrics.intervals import Estimate
+from nolbo_ppl.metrics.records import DetectionRecords, ObjectRecords, concatenate
 from nolbo_ppl.metrics.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
 from nolbo_ppl.models.config import ModelConfig
 
@@ -234,9 +227,8 @@ def _number(value: float | None) -> str:
 
 def run(config: EvaluateConfig) -> Evaluation:
     """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`."""
-    model: ObservationModel | Pyramid = load(config.model)
-    if config.sizes:
-        model = Pyramid(model, config.sizes)
+    loaded = load(config.model)
+    model = Pyramid(loaded, config.sizes) if config.sizes else loaded
     scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
     if config.retrieval:

@@ -20,7 +20,7 @@ from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels
 from nolbo_ppl.inference.observations import Observations
 from nolbo_ppl.metrics.calibration import chi_square_mass, circular_crps
 from nolbo_ppl.metrics.detection import Matches, match
-from nolbo_ppl.metrics.figures import DetectionRecords, ObjectRecords
+from nolbo_ppl.metrics.records import DetectionRecords, ObjectRecords
 from nolbo_ppl.metrics.viewpoint import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_average_precision, voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture

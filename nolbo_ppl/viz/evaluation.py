@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from nolbo_ppl.metrics.calibration import Reliability, reliability, top_label
 from nolbo_ppl.metrics.detection import Matches, average_precision, precision_recall
-from nolbo_ppl.metrics.figures import DetectionRecords, ObjectRecords, confusion, judged
+from nolbo_ppl.metrics.figures import confusion, judged
 from nolbo_ppl.metrics.intervals import wilson_interval
+from nolbo_ppl.metrics.records import DetectionRecords, ObjectRecords
 from nolbo_ppl.metrics.retrieval import SCORES, RetrievalRecords
 from nolbo_ppl.metrics.viewpoint import ACCURATE
 from nolbo_ppl.viz.style import INK, MUTED, category_colour, grid, new_figure, save, styled

@@ -12,7 +12,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.inference.measure import SceneTruth
 from nolbo_ppl.inference.observations import Observations
-from nolbo_ppl.metrics.figures import ObjectRecords
+from nolbo_ppl.metrics.records import ObjectRecords
 from nolbo_ppl.viz.overlay import draw_frame, show_part
 from nolbo_ppl.viz.shape import draw_shape
 from nolbo_ppl.viz.style import MUTED, TRUTH, category_colour, new_figure, plain, save, styled
