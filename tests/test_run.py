@@ -62,7 +62,8 @@ def test_every_file_is_written_and_the_loop_is_closed(known: SimulatedDrive, fin
     assert summary["frames"] == 120 and summary["after"]["ate"] < 0.4 * summary["before"]["ate"]
     assert summary["after_over_oracle"] < 2 and summary["after_over_before"] == pytest.approx(
         summary["after"]["ate"] / summary["before"]["ate"], abs=1e-5)  # fmt: skip
-    assert summary["loops"]["precision"] > 0.95 and summary["loops"]["recall"] > 0.6
+    # At the image's border some detections are of objects that the truth just left out: they are not held to be theirs.
+    assert summary["loops"]["precision"] > 0.9 and summary["loops"]["recall"] > 0.9
     chart = summary["map"]
     assert chart["landmarks"] == summary["landmarks"] and chart["objects_mapped"] >= 0.8 * chart["objects_detected"]
     assert chart["duplicates"] <= 2 and chart["median_position_error"] < 0.5

@@ -139,9 +139,9 @@ def coverage_figures(
         difference = true["position"][stated] - table.position[stated]
         out["position"] = finite(coverage(chi_square_mass(difference, table.position_covariance[stated])))
     symmetry = truth.symmetry[matched.object]
-    oriented = np.array([k for k in rows if modes[k] and symmetry[k] != 0], dtype=np.int64)  # a free axis has no azimuth
+    oriented = np.array([k for k in rows.tolist() if modes[k] and symmetry[k] != 0], dtype=np.int64)  # a free axis has no azimuth
     if len(oriented):
-        known = [modes[k] or () for k in oriented]
+        known = [modes[k] or () for k in oriented.tolist()]
         mass = orientation_mass(known, true["position"][oriented], true["rotation"][oriented], symmetry[oriented])
         out["orientation"] = finite(coverage(mass))
     shaped = rows[table.has_latent[rows]]

@@ -18,13 +18,8 @@ from nolbo_ppl.mission.depth import DepthScale, read_depth, refine_positions, st
 STRUCTURED_LIGHT = 0.0015
 """Growth of the error of a structured light camera's depth with its square, 1/m (Khoshelham and Elberink 2012)."""
 Picture = UInt8[np.ndarray, "h w 3"]
-
-
-class Observer(Protocol):
-    """What observing needs of a model (`ObservationModel`, or `Pyramid` for several sizes)."""
-
-    def observe(self, images: Any, intrinsics: Any = None, **options: Any) -> Any:
-        """Posterior of every object of each image."""
+Observe = Callable[[Sequence[Picture], Float[np.ndarray, " 4"]], Sequence[Observations]]
+"""Images of one camera and its intrinsics to what is observed in each."""
 
 
 class DepthSource(Protocol):
@@ -109,29 +104,24 @@ def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Pa
 
 
 def observed_rows(
-    model: Observer, read: Callable[[int], Picture], names: Sequence[str], intrinsics: Float[np.ndarray, " 4"], *,
-    threshold: float, batch: int, depth: DepthSource, **options: Any,
+    observe: Observe, read: Callable[[int], Picture], names: Sequence[str], intrinsics: Float[np.ndarray, " 4"],
+    depth: DepthSource, batch: int,
 ) -> Iterator[dict[str, Any]]:
     """Lines of `observations.jsonl`, batch by batch, with a progress bar on a terminal.
 
     Args:
-        model: observes images.
+        observe: observations of each of some images of one camera.
         read: image of a keyframe.
         names: what each keyframe's image is called.
         intrinsics: [fx, fy, cx, cy], px.
-        threshold: least objectness.
-        batch: images in memory at once.
         depth: refines positions where it is known.
-        options: passed on to the model.
+        batch: images in memory at once.
     """
     with tqdm(total=len(names), desc="observing", unit="image", disable=None) as bar:
         for first in range(0, len(names), batch):
             frames = range(first, min(first + batch, len(names)))
             images = [read(k) for k in frames]
-            answers: list[Observations] = model.observe(
-                images, intrinsics, threshold=threshold, decode=False, batch=batch, **options
-            )
-            for k, image, observed in zip(frames, images, answers):
+            for k, image, observed in zip(frames, images, observe(images, intrinsics)):
                 known = depth.depth(k, image)
                 if known is not None:
                     observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)

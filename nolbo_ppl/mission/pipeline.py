@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,6 @@ from nolbo_ppl.mission.depth import DepthScale
 from nolbo_ppl.mission.observe import (
     DepthPictures,
     DepthSource,
-    Observer,
     SequenceDepth,
     StereoPairs,
     beside,
@@ -126,14 +125,12 @@ class Mission:
     def observe(self) -> None:
         """The guide on every keyframe."""
         config = self.config
-        observer: Observer = self.model
-        options: dict[str, Any] = {"size": config.sizes[0]}
+        options: dict[str, Any] = {"threshold": config.threshold, "decode": False, "batch": config.batch}
         if len(config.sizes) > 1:
-            observer, options = Pyramid(self.model, config.sizes), {}
-        rows = observed_rows(
-            observer, self.read, self.names, self.drive.intrinsics, threshold=config.threshold, batch=config.batch,
-            depth=self.depth_source(), **options,
-        )  # fmt: skip
+            ask = partial(Pyramid(self.model, config.sizes).observe, **options)
+        else:
+            ask = partial(self.model.observe, size=config.sizes[0], **options)
+        rows = observed_rows(ask, self.read, self.names, self.drive.intrinsics, self.depth_source(), config.batch)
         write_jsonl(self.out / "observations.jsonl", rows)
 
     def slam(self) -> None:

@@ -166,9 +166,12 @@ def estimate_or_read(drive: Drive, config: RunConfig) -> FoundOdometry:
     stated = covariance is not None and len(covariance) == len(poses) - 1
     n = len(poses) - 1
     every = Odometry(
-        poses, covariance if covariance is not None and stated else np.zeros((n, 6, 6)), *np.zeros((2, n), dtype=np.int64),
-        np.zeros(n, dtype=np.uint8),
-    )  # fmt: skip
+        T_world_camera=poses,
+        covariance=covariance if covariance is not None and stated else np.zeros((n, 6, 6)),
+        matches=np.zeros(n, dtype=np.int64),
+        inliers=np.zeros(n, dtype=np.int64),
+        flags=np.zeros(n, dtype=np.uint8),
+    )
     return FoundOdometry(at_keyframes(every, drive.used), stated)
 
 

@@ -20,7 +20,7 @@ def test_the_demonstration_ends_in_a_table_and_a_report(tmp_path: Path, monkeypa
 
     def small(name: str, world: drives.config.WorldName, seed: int) -> drives.DriveConfig:
         asked.append((name, world, seed))
-        return replace(preset("demo", world, seed), frames=6, size=(128, 64), objects=8, clutter=4)
+        return replace(preset("demo", world, seed), frames=6, laps=0.3, step=5.0, size=(128, 64), objects=8, clutter=4)
 
     monkeypatch.setattr(drives, "drive_preset", small)
     save(tmp_path / "model", tiny_model(scatter=0.1).float(), Calibration(objectness_shift=-2.0), {})
