@@ -161,3 +161,23 @@ def test_real_boxes_project_onto_each_other(data_dir: Path, tmp_path: Path) -> N
             for label in labels if label.kind == "Car" and label.truncated == 0
         ]  # fmt: skip
     assert np.median(off) < 1.5 and np.max(off) < 5.0
+
+
+@pytest.mark.parametrize(
+    ("ignore", "message"),
+    [
+        ('{"a": 1}', r"scenes\.jsonl:1: ignore: got \{'a': 1\}, expected a list of boxes"),
+        ("[[1, 2, 3]]", r"scenes\.jsonl:1: ignore\[0\]\.box"),
+        ("[[0, 0, 20, 20], [5, 5, 4, 20]]", r"ignore\[1\]\.box.*x0 < x1"),
+        ("[[0, 0, 900, 20]]", r"ignore\[0\]\.box.*inside the image of 200 x 120 px"),
+    ],
+)
+def test_regions_to_ignore_are_checked(tmp_path: Path, ignore: str, message: str) -> None:
+    converted(tmp_path, REGION)
+    file = tmp_path / "out" / "scenes.jsonl"
+    row = {**json.loads(file.read_text()), "ignore": "HERE"}
+    file.write_text(json.dumps(row).replace('"HERE"', ignore))
+    with pytest.raises(InputError, match=message):
+        SceneFolder(tmp_path / "out")
+    file.write_text(json.dumps({**row, "ignore": None}))
+    assert SceneFolder(tmp_path / "out").records[0].ignore.shape == (0, 4)
