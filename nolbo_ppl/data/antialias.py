@@ -9,7 +9,7 @@ from nolbo_ppl.data.render import Hits, shade, shade_rays, trace_pixels
 from nolbo_ppl.data.view import View
 from nolbo_ppl.errors import input_error
 
-CONTRAST = 0.05
+CONTRAST = 0.08
 """Difference of display values (full range 1) from a neighbour from which on a pixel is rendered again."""
 
 
@@ -29,7 +29,7 @@ def uneven(colour: Float[np.ndarray, "height width 3"], contrast: float = CONTRA
 def shade_smoothly(view: View, hits: Hits, rays: int, contrast: float = CONTRAST) -> Float[np.ndarray, "height width 3"]:
     """Linear RGB of every pixel, the mean of `rays` by `rays` rays where it differs from a neighbour.
 
-    Four rays everywhere cost 2.5 times as much and look the same.
+    Four rays everywhere cost twice as much and look the same.
 
     Args:
         view: what there is to see; no background picture.

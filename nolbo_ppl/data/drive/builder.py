@@ -21,8 +21,9 @@ def turned(angle: float) -> Float[np.ndarray, "3 3"]:
 class Frame:
     """A place with a heading: its local x runs along the heading, y to the left, z up."""
 
-    def __init__(self, x: float, y: float, heading: float, z: float = 0.0) -> None:
-        self.origin, self.R, self.heading = np.array([x, y, z]), turned(heading), heading
+    def __init__(self, place: Float[np.ndarray, " n"], heading: float, z: float = 0.0) -> None:
+        self.origin = np.array([place[0], place[1], z], dtype=np.float64)
+        self.R, self.heading = turned(heading), float(heading)
 
     def __call__(self, x: float, y: float, z: float = 0.0) -> Float[np.ndarray, " 3"]:
         """A local point in the ground frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def build_indoor(loop: Loop, placer: Placer, clutter: int, rng: np.random.Genera
         footprint = placer.block(point, float(heading), (size / 2, size / 2), (-1, size))
         if placer.free(footprint):
             placer.taken.append(footprint)
-            scenery.litter(builder, *point, size, rng)
+            scenery.litter(builder, point, size, rng)
     return builder
 
 
@@ -87,7 +88,7 @@ def _floor(builder: StaticBuilder, loop: Loop, rng: np.random.Generator) -> np.n
     for number, s in enumerate(np.arange(0, loop.length, 2.2)):
         lateral = 0.0 if number % 2 else rng.uniform(-3, 3)
         point, heading = loop.at(s, lateral)
-        frame = Frame(*point, float(heading) + rng.normal(0, 0.1), 0.004 + 0.0005 * number % 0.004)
+        frame = Frame(point, float(heading) + rng.normal(0, 0.1), 0.004 + 0.0005 * (number % 8))
         a, b = rng.uniform(0.5, 1.1), rng.uniform(0.35, 0.7)
         pattern, frequency = [("lattice", 4.0), ("grain", 5.0), ("slabs", 6.0), ("stripes", 3.0)][int(rng.integers(4))]
         for scale, z, colour in (
@@ -95,7 +96,8 @@ def _floor(builder: StaticBuilder, loop: Loop, rng: np.random.Generator) -> np.n
             (0.86, 0.003, Material(hsv(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.4, 0.8)), 0.0,
                                    pattern=pattern, contrast=0.5, frequency=frequency)),
         ):  # fmt: skip
-            builder.quad(*(frame(scale * a * x, scale * b * y, z) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))), colour)
+            corner = [frame(scale * a * x, scale * b * y, z) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            builder.polygon(np.array(corner), colour)
     return corners
 
 
@@ -132,7 +134,7 @@ def _outer_wall(builder: StaticBuilder, placer: Placer, corners: np.ndarray, rng
         a, b = corners[k], corners[(k + 1) % 4]
         length, along = float(np.linalg.norm(b - a)), (b - a) / np.linalg.norm(b - a)
         # The room lies to the left of the way from a to b: -y of a frame that runs from b to a.
-        wall = Frame(*(0.5 * (a + b)), float(np.arctan2(-along[1], -along[0])))
+        wall = Frame(0.5 * (a + b), float(np.arctan2(-along[1], -along[0])))
         builder.panel(wall, (-length / 2, 0), (length / 2, HEIGHT), _wall_material(rng))
         placer.taken.append(placer.block(wall.origin, wall.heading, (length / 2 + 1, 0.1), (-1, HEIGHT)))
         _dress(builder, wall, length, rng, windows=True)
@@ -146,7 +148,7 @@ def _partition(builder: StaticBuilder, placer: Placer, wall: Frame, length: floa
     placer.taken.append(footprint)
     builder.box(wall, (-length / 2, -0.08, 0), (length / 2, 0.08, HEIGHT), _wall_material(rng))
     for turn, shift in ((0.0, -0.08), (np.pi, 0.08)):
-        side = Frame(*wall(0, shift)[:2], wall.heading + turn)
+        side = Frame(wall(0, shift), wall.heading + turn)
         _dress(builder, side, length, rng, windows=False)
     return True
 
@@ -163,7 +165,7 @@ def _bays(builder: StaticBuilder, loop: Loop, placer: Placer, rng: np.random.Gen
         width = rng.uniform(3.0, 4.6)
         point, heading = loop.at(s, -loop.inner * (BAY - 1.5))
         if rng.random() < 0.45:
-            _partition(builder, placer, Frame(*point, float(heading) + np.pi / 2), 2.8, rng)
+            _partition(builder, placer, Frame(point, float(heading) + np.pi / 2), 2.8, rng)
         groups += _bay(builder, loop, placer, s + width / 2, -loop.inner, BAY, rng)
         s += width
     return groups
@@ -176,22 +178,22 @@ def _bay(
 
     def around(lateral: float, shift: float) -> Frame:
         point, heading = loop.at(s + shift, side * lateral)
-        return Frame(*point, float(heading) + side * np.pi / 2)  # x away from the passage
+        return Frame(point, float(heading) + side * np.pi / 2)  # x away from the passage
 
     groups: list[Group] = []
     for lateral, shift in ((2.6, 0.0), (depth - 0.7, rng.uniform(-0.8, 0.8)), (depth - 1.6, 1.6)):
         frame = around(lateral + rng.normal(0, 0.15), shift + rng.normal(0, 0.3))
         kind = rng.random()
         if kind < 0.33:
-            groups.append(lambda frame=frame: _dining(placer, frame, rng))
+            groups.append(partial(_dining, placer, frame, rng))
         elif kind < 0.55:
-            groups.append(lambda frame=frame: _lounge(builder, placer, frame, rng))
+            groups.append(partial(_lounge, builder, placer, frame, rng))
         elif kind < 0.78:
-            groups.append(lambda frame=frame: _desk(placer, frame, rng))
+            groups.append(partial(_desk, placer, frame, rng))
         elif kind < 0.9:
-            groups.append(lambda frame=frame: _row(placer, frame, rng))
+            groups.append(partial(_row, placer, frame, rng))
         else:
-            groups.append(lambda frame=frame: _cycle(placer, frame, rng))
+            groups.append(partial(_cycle, placer, frame, rng))
     return groups
 
 
@@ -237,7 +239,7 @@ def _lounge(builder: StaticBuilder, placer: Placer, frame: Frame, rng: np.random
     placer.taken.append(footprint)
     colour = hsv(rng.uniform(0.05, 0.1), 0.45, rng.uniform(0.25, 0.8))
     wood = Material(colour, 0.1, pattern="planks", contrast=0.25, frequency=6.0)
-    place = Frame(*point, facing + np.pi / 2)
+    place = Frame(point, facing + np.pi / 2)
     builder.box(place, (-half[0], -half[1], 0), (half[0], half[1], SIDEBOARD), wood)
 
 
@@ -278,7 +280,7 @@ def _middle(builder: StaticBuilder, loop: Loop, placer: Placer, rng: np.random.G
         reach = ((inner - centre) @ directions[0]).max()
         heading = float(np.arctan2(directions[0, 1], directions[0, 0]))
         if reach > 0.8:
-            _partition(builder, placer, Frame(*centre, heading), 2 * float(reach), rng)
+            _partition(builder, placer, Frame(centre, heading), 2 * float(reach), rng)
     s = rng.uniform(0, 1)
     while s < loop.length - 1.5:
         groups += _bay(builder, loop, placer, s, loop.inner, 3.6, rng)

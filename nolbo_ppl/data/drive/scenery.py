@@ -38,9 +38,11 @@ def facade_material(rng: np.random.Generator) -> Material:
     return Material(hsv(0.09, rng.uniform(0.05, 0.2), 0.7), 0.02, pattern="slabs", contrast=0.3, frequency=1.6)
 
 
-def _window(builder: StaticBuilder, wall: Frame, x: float, z: float, width: float, height: float, glass: Material) -> None:
+def _window(
+    builder: StaticBuilder, wall: Frame, x: float, z: float, size: tuple[float, float], glass: Material
+) -> None:
     """A window on the plane y = 0 of a frame whose outside is -y: sill and frame, glass, a bar."""
-    rim = 0.08
+    (width, height), rim = size, 0.08
     x0, x1, z0, z1 = x - width / 2, x + width / 2, z, z + height
     builder.panel(wall, (x0 - rim, z0 - rim), (x1 + rim, z1 + rim), FRAME, -0.03)
     for a, b in ((x0, x - 0.03), (x + 0.03, x1)):
@@ -53,7 +55,7 @@ def _storey(builder: StaticBuilder, wall: Frame, width: float, z: float, rng: np
     for k in range(count):
         x = -width / 2 + (k + 0.5) * width / count
         glass = GLASS[int(rng.choice(3, p=[0.5, 0.4, 0.1]))]
-        _window(builder, wall, x, z + 0.95, look["window"][0], look["window"][1], glass)
+        _window(builder, wall, x, z + 0.95, look["window"], glass)
         if rng.random() < 0.15:
             box = Material(hsv(rng.random(), 0.8, 0.7), pattern="leaves", contrast=0.6, frequency=7.0)
             builder.box(wall, (x - 0.5, -0.35, z + 0.75), (x + 0.5, -0.05, z + 1.05), box)
@@ -70,9 +72,10 @@ def _ground_floor(builder: StaticBuilder, wall: Frame, width: float, rng: np.ran
             continue
         if not shop:
             for k in range(count := max(1, int((high - low) / look["pitch"]))):
-                _window(builder, wall, low + (k + 0.5) * (high - low) / count, 0.95, *look["window"], GLASS[int(rng.integers(2))])
+                glass = GLASS[int(rng.integers(2))]
+                _window(builder, wall, low + (k + 0.5) * (high - low) / count, 0.95, look["window"], glass)
             continue
-        _window(builder, wall, 0.5 * (low + high), 0.5, high - low - 0.2, 1.9, GLASS[1])
+        _window(builder, wall, 0.5 * (low + high), 0.5, (high - low - 0.2, 1.9), GLASS[1])
         goods = rng.integers(2, 5)
         for k in range(goods):  # posters behind the pane
             middle = low + (k + 0.5) * (high - low) / goods
@@ -106,9 +109,9 @@ def house(
                     pattern="brick", contrast=0.3, frequency=2.0)  # fmt: skip
     builder.box(front, (-width / 2, 0, 0), (width / 2, depth, height), material, roof)
     builder.box(front, (-width / 2 - 0.05, -0.06, 0), (width / 2 + 0.05, 0, 0.45), CONCRETE)
-    side_left = Frame(*front(-width / 2, depth / 2)[:2], front.heading - np.pi / 2, front.origin[2])
-    side_right = Frame(*front(width / 2, depth / 2)[:2], front.heading + np.pi / 2, front.origin[2])
-    rear = Frame(*front(0, depth)[:2], front.heading + np.pi, front.origin[2])
+    side_left = Frame(front(-width / 2, depth / 2), front.heading - np.pi / 2, front.origin[2])
+    side_right = Frame(front(width / 2, depth / 2), front.heading + np.pi / 2, front.origin[2])
+    rear = Frame(front(0, depth), front.heading + np.pi, front.origin[2])
     _ground_floor(builder, front, width, rng, shop, look)
     for level in range(1, storeys):
         _storey(builder, front, width, 3.2 * level + (0.6 if shop else 0.2), rng, look)
@@ -148,13 +151,13 @@ def poster(
         if rng.random() < 0.6:
             patch(u[0], v[0], u[1], v[1], lift, colour)
         else:
-            corners = np.array([at(*rng.random(2), lift) for _ in range(3)])
+            corners = np.array([at(a, b, lift) for a, b in rng.random((3, 2))])
             builder.polygon(corners, colour)
 
 
-def tree(builder: StaticBuilder, x: float, y: float, height: float, rng: np.random.Generator) -> None:
+def tree(builder: StaticBuilder, place: np.ndarray, height: float, rng: np.random.Generator) -> None:
     """A trunk with a crown of a few balls, or a conifer."""
-    frame = Frame(x, y, rng.uniform(-np.pi, np.pi))
+    frame = Frame(place, rng.uniform(-np.pi, np.pi))
     green = Material(hsv(rng.uniform(0.2, 0.36), rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.6)), 0.02,
                      pattern="leaves", contrast=0.75, frequency=2.0)  # fmt: skip
     if rng.random() < 0.2:
@@ -191,18 +194,18 @@ def fence(builder: StaticBuilder, frame: Frame, length: float, rng: np.random.Ge
         builder.box(frame, (-length / 2, 0.02, z), (length / 2, 0.08, z + 0.1), wood)
 
 
-def lamp_post(builder: StaticBuilder, x: float, y: float, heading: float) -> None:
+def lamp_post(builder: StaticBuilder, place: np.ndarray, heading: float) -> None:
     """A street lamp whose arm points along the heading."""
-    frame = Frame(x, y, heading)
+    frame = Frame(place, heading)
     builder.solid("cylinder", frame, (0, 0, 0.4), (0.26, 0.26, 0.8), METAL)
     builder.solid("cylinder", frame, (0, 0, 2.6), (0.13, 0.13, 5.2), METAL)
     builder.box(frame, (0, -0.05, 5.1), (1.4, 0.05, 5.2), METAL)
     builder.box(frame, (1.0, -0.15, 5.0), (1.7, 0.15, 5.12), Material(hsv(0.12, 0.1, 0.95), glow=0.5))
 
 
-def sign_post(builder: StaticBuilder, x: float, y: float, heading: float, rng: np.random.Generator) -> None:
+def sign_post(builder: StaticBuilder, place: np.ndarray, heading: float, rng: np.random.Generator) -> None:
     """A traffic sign that faces against the heading."""
-    frame = Frame(x, y, heading)
+    frame = Frame(place, heading)
     height = rng.uniform(2.0, 2.5)
     builder.solid("cylinder", frame, (0, 0, height / 2), (0.08, 0.08, height), METAL)
     sides = int(rng.choice([3, 4, 8, 16]))
@@ -217,11 +220,11 @@ def sign_post(builder: StaticBuilder, x: float, y: float, heading: float, rng: n
 
 
 def litter(
-    builder: StaticBuilder, x: float, y: float, size: float, rng: np.random.Generator, z: float = 0.0
+    builder: StaticBuilder, place: np.ndarray, size: float, rng: np.random.Generator, z: float = 0.0
 ) -> None:
     """A random piece of clutter of a given box diagonal standing on the ground."""
     parts, box = sample_clutter(rng)
-    frame = Frame(x, y, rng.uniform(-np.pi, np.pi))
+    frame = Frame(place, rng.uniform(-np.pi, np.pi))
     roles = rng.choice(["body", "wood", "metal", "fabric", "trim"], size=len(parts), p=[0.45, 0.2, 0.1, 0.2, 0.05])
     for part, role in zip(parts, roles):
         vertices, faces = unit_mesh(part.kind)

@@ -15,7 +15,8 @@ from nolbo_ppl.data.drive.config import DriveConfig
 from nolbo_ppl.data.drive.indoor import build_indoor
 from nolbo_ppl.data.drive.path import Loop, Wobble, camera_poses, drive_track, random_loop
 from nolbo_ppl.data.drive.placing import Catalogue, Look, Placer, WorldObject
-from nolbo_ppl.data.drive.street import LANE, build_street
+from nolbo_ppl.data.drive.street import build_street
+from nolbo_ppl.data.drive.street_ground import LANE
 from nolbo_ppl.data.materials import Material, hsv
 from nolbo_ppl.data.pool import ShapePool
 from nolbo_ppl.data.scene_config import SceneConfig
