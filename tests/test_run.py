@@ -25,8 +25,8 @@ from tests.factories import tiny_model
 from tests.mission.conftest import DIAGONAL, SimulatedDrive, drive  # noqa: F401
 
 FILES = {
-    "crops", "frames.jsonl", "intrinsics.json", "map.glb", "observations.jsonl", "odometry.txt", "run.json", "slam",
-    "summary.json", "truth.txt",
+    "crops", "frames.jsonl", "intrinsics.json", "map.glb", "objects.json", "observations.jsonl", "odometry.txt", "run.json",
+    "slam", "summary.json", "truth.txt",
 }  # fmt: skip
 
 
@@ -98,6 +98,14 @@ def test_frames_name_the_images_as_seen_from_the_run(known: SimulatedDrive, fini
     assert (camera["width"], camera["height"]) == (192, 96)
 
 
+def test_whose_each_observation_is_can_be_looked_up(known: SimulatedDrive, finished: Path) -> None:
+    objects = read_json(finished / "objects.json")["objects"]
+    ids = [json.loads(line)["id"] for line in (finished / "observations.jsonl").read_text().splitlines()]
+    assert list(objects) == ids
+    assert {name for name in objects.values() if name is not None} <= {f"O{i}" for i in range(20)}
+    assert sum(name is not None for name in objects.values()) > 0.8 * len(ids)
+
+
 def test_a_finished_run_is_not_done_again(known: SimulatedDrive, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = known.model.calls
     before = read_json(finished / "run.json")
@@ -113,7 +121,8 @@ def test_an_interruption_keeps_what_is_complete(
     known: SimulatedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
-    config = config_of(known, out, truth_objects=None, every=2, slam=replace(config_of(known, out).slam, em_iterations=1))
+    short = replace(config_of(known, out).slam, em_iterations=1)
+    config = config_of(known, out, truth_objects=None, every=2, online=True, slam=short)
     write = pipeline.write_crops
 
     def interrupted(folder: Path, *arguments: Any) -> None:

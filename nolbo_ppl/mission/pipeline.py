@@ -154,13 +154,15 @@ class Mission:
         write_crops(self.out / "crops", best_views(seen, found), self.read)
 
     def figures(self) -> None:
-        """summary.json."""
+        """summary.json, and whose each observation is where the truth tells."""
         config = self.config
-        summary = summarise(
+        summary, objects = summarise(
             self.out, self.seconds, self.cpu_seconds, self.problem, drive=config.truth_objects,
             model=None if config.truth_objects is None else self.model, config=config.slam, loop_gap=config.loop_gap,
             seed=config.seed,
         )  # fmt: skip
+        if objects is not None:
+            write_json(self.out / "objects.json", objects)
         write_json(self.out / "summary.json", summary)
 
     def report(self) -> None:
@@ -187,8 +189,8 @@ class Mission:
             Stage("slam", ("slam",), of("slam", "online"), self.slam),
             Stage("map", ("map.glb",), {}, self.map),
             Stage("crops", ("crops",), {}, self.crops),
-            Stage("figures", ("summary.json",), {**of("loop_gap", "seed"), "drive": drive_digest(config.truth_objects)},
-                  self.figures),
+            Stage("figures", ("summary.json", "objects.json?"),
+                  {**of("loop_gap", "seed"), "drive": drive_digest(config.truth_objects)}, self.figures),
         ]  # fmt: skip
         return [*stages, Stage("report", ("report.html",), {}, self.report)] if config.report else stages
 

@@ -138,13 +138,12 @@ def observation_figures(
 
 
 def truth_figures(
-    result: RunResult, problem: SlamProblem, truth: DriveTruth, model: ShapeModel | None, config: SlamConfig, loop_gap: int,
-    rng: np.random.Generator,
+    result: RunResult, problem: SlamProblem, truth: DriveTruth, loosely: Int[np.ndarray, " k"], model: ShapeModel | None,
+    config: SlamConfig, loop_gap: int, rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Everything that is held against the true objects."""
+    """Everything that is held against the true objects; `loosely` is whose each observation is, for its association."""
     table = result.table
     matched = match_detections(table.frame, result.box, table.objectness, truth)
-    loosely = match_detections(table.frame, result.box, table.objectness, truth, ASSOCIATION_IOU).object
     owner, purity = owners(loosely, result.landmark_of, len(result.landmarks))
     out: dict[str, Any] = {
         "observation_figures": observation_figures(result, matched, truth, model),
@@ -181,8 +180,8 @@ def time_figures(seconds: Mapping[str, float], cpu_seconds: Mapping[str, float],
 def summarise(
     folder: Path, seconds: Mapping[str, float], cpu_seconds: Mapping[str, float], problem: SlamProblem, *,
     drive: Path | None, model: ShapeModel | None, config: SlamConfig, loop_gap: int, seed: int,
-) -> dict[str, Any]:
-    """Everything `summary.json` holds.
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """Everything `summary.json` holds, and `objects.json`: the true object of each observation, where there is a truth.
 
     Args:
         folder: the run, complete up to its crops.
@@ -203,10 +202,14 @@ def summarise(
         "loop_pairs": result.slam.get("loop_pairs"),
         **trajectory_figures(result),
     }
+    objects = None
     if drive is not None:
-        truth = read_truth(drive, result.images)
-        out |= truth_figures(result, problem, truth, model, config, loop_gap, np.random.default_rng([seed, 3]))
-    return {**out, **time_figures(seconds, cpu_seconds, len(result.estimate)), "warnings": result.slam.get("warnings", [])}
+        truth, table = read_truth(drive, result.images), result.table
+        loosely = match_detections(table.frame, result.box, table.objectness, truth, ASSOCIATION_IOU).object
+        objects = {"objects": {name: truth.names[i] if i >= 0 else None for name, i in zip(table.id, loosely.tolist())}}
+        out |= truth_figures(result, problem, truth, loosely, model, config, loop_gap, np.random.default_rng([seed, 3]))
+    out |= time_figures(seconds, cpu_seconds, len(result.estimate))
+    return {**out, "warnings": result.slam.get("warnings", [])}, objects
 
 
 def figure_table(summary: Mapping[str, Any]) -> str:
