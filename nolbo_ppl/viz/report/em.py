@@ -9,7 +9,7 @@ import numpy as np
 
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.viz.report.folder import RunFolder
-from nolbo_ppl.viz.report.plots import above, axis_label, way_lines
+from nolbo_ppl.viz.report.plots import above, axis_label, near, way_lines
 from nolbo_ppl.viz.report.svg import Axes, element, equal_axes, escape, number, picture, text
 from nolbo_ppl.viz.report.text import say, table
 
@@ -53,7 +53,8 @@ def em_slider(run: RunFolder) -> str:
     every = [above(run, T[:, :3, 3]) for T in iterations.T_world_camera]
     spots = [above(run, points) for points in iterations.landmarks]
     fixed = [] if run.truth is None else [above(run, run.truth[:, :3, 3])]
-    axes = equal_axes(np.concatenate([*every, *spots, *fixed]))
+    driven = np.concatenate([*every, *fixed])
+    axes = equal_axes(np.concatenate([driven, *(points[near(driven, points)] for points in spots)]))
     rows = np.unique(np.linspace(0, len(run) - 1, min(len(run), MOST_POSES)).round().astype(int))
     errors, described = iteration_errors(run), steps(run)
     data = []
@@ -73,7 +74,7 @@ def em_slider(run: RunFolder) -> str:
             said.append(f"{len(points)} landmarks")
         dots = " ".join(f"M{number(u)} {number(v)}h0" for u, v in zip(axes.px(points[:, 0]), axes.py(points[:, 1])))
         data.append({"way": axes.points(way[rows]), "dots": dots, "say": " · ".join(said)})
-    moving = element("path", d=data[-1]["dots"], class_="dots", data_em="dots")
+    moving = axes.clip([element("path", d=data[-1]["dots"], class_="dots", data_em="dots")])
     moving += element("polyline", points=data[-1]["way"], class_="line estimate", data_em="way")
     first = axes.line(every[0], class_="line odometry faint")
     plot = picture(

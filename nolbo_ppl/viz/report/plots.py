@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nolbo_ppl.geometry.pose import relative, rotation_angle
 from nolbo_ppl.metrics.trajectory import align
 from nolbo_ppl.viz.report.folder import RunFolder
 from nolbo_ppl.viz.report.landmarks import RunLandmark
 from nolbo_ppl.viz.report.loops import Loop, is_right
-from nolbo_ppl.viz.report.svg import Axes, element, equal_axes, group, number, picture
+from nolbo_ppl.viz.report.svg import CHI2_95, Axes, element, equal_axes, group, number, picture
 from nolbo_ppl.viz.report.text import say
 from nolbo_ppl.viz.style import MUTED, category_colour
 
@@ -40,12 +40,30 @@ def ways(run: RunFolder) -> dict[str, Float[np.ndarray, "n 4 4"]]:
     return {name: T for name, _ in LINES if (T := getattr(run, name)) is not None}
 
 
+def near(way: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
+    """Points within half the way's extent (at least 10 m) of its box: one far outlier must not shrink the whole picture."""
+    low, high = way.min(axis=0), way.max(axis=0)
+    reach = max(0.5 * float((high - low).max()), 10.0)
+    return ((points >= low - reach) & (points <= high + reach)).all(axis=1)
+
+
 def map_axes(run: RunFolder, landmarks: bool = True) -> Axes:
-    """Axes around all trajectories and, if wanted, all landmarks."""
-    points = [above(run, T[:, :3, 3]) for T in ways(run).values()]
-    if landmarks and run.landmarks:
-        points.append(above(run, np.array([x.position for x in run.landmarks])))
-    return equal_axes(np.concatenate(points))
+    """Axes around all trajectories and, if wanted, the landmarks near them."""
+    way = np.concatenate([above(run, T[:, :3, 3]) for T in ways(run).values()])
+    if not landmarks or not run.landmarks:
+        return equal_axes(way)
+    places = above(run, np.array([x.position for x in run.landmarks]))
+    return equal_axes(np.concatenate([way, places[near(way, places)]]))
+
+
+def outside(run: RunFolder, axes: Axes) -> int:
+    """How many landmarks lie outside the picture."""
+    return int((~axes.holds(above(run, np.array([x.position for x in run.landmarks]).reshape(-1, 3)))).sum())
+
+
+def is_wide(axes: Axes, covariance: Float[np.ndarray, "2 2"]) -> bool:
+    """Whether an ellipse is so large that it would cover the picture: its longer half axis is a quarter of the width."""
+    return float(np.sqrt(CHI2_95 * max(np.linalg.eigvalsh(covariance)[-1], 0))) > 0.25 * (axes.x[1] - axes.x[0])
 
 
 def _ends(axes: Axes, xy: Float[np.ndarray, "n 2"]) -> str:
@@ -111,7 +129,8 @@ def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
         mark = ""
         if ellipses and landmark.position_covariance is not None:
             covariance = landmark.position_covariance[np.ix_(index, index)]
-            mark = axes.ellipse(xy, covariance, class_="ellipse", style=f"stroke:{colour};fill:{colour}")
+            kind = "ellipse wide" if is_wide(axes, covariance) else "ellipse"
+            mark = axes.ellipse(xy, covariance, class_=kind, style=f"stroke:{colour};fill:{colour}")
         weak = landmark.existence is not None and landmark.existence < 0.5
         mark += element(
             "circle",
@@ -124,7 +143,7 @@ def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
         parts.append(
             group([mark], data_tip=landmark_tip(landmark), data_card=k, data_layer=f"category-{category_number(run, landmark)}")
         )
-    return "".join(parts)
+    return axes.clip(parts)
 
 
 def category_number(run: RunFolder, landmark: RunLandmark) -> int:

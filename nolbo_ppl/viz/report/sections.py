@@ -11,7 +11,17 @@ from nolbo_ppl.viz.report.folder import RunFolder
 from nolbo_ppl.viz.report.gallery import gallery
 from nolbo_ppl.viz.report.heatmap import heat_map
 from nolbo_ppl.viz.report.loops import find_loops, is_right, loop_gap, loop_scores
-from nolbo_ppl.viz.report.plots import LINES, loop_plot, map_plot, time_plot, trajectory_errors, trajectory_plot, ways
+from nolbo_ppl.viz.report.plots import (
+    LINES,
+    loop_plot,
+    map_axes,
+    map_plot,
+    outside,
+    time_plot,
+    trajectory_errors,
+    trajectory_plot,
+    ways,
+)
 from nolbo_ppl.viz.report.svg import element, escape
 from nolbo_ppl.viz.report.text import figures_tables, say, settings_table
 from nolbo_ppl.viz.style import MUTED, category_colour
@@ -79,8 +89,11 @@ def world_map(run: RunFolder) -> str:
         entries.append(("category--1", "no category", MUTED))
     caption = (
         "Landmarks in the colours of their categories, with the ellipses that hold their positions with probability 0.95; "
-        "hollow: existence below one half."
+        "hollow: existence below one half; dashed: too uncertain to fill."
     )
+    left_out = outside(run, map_axes(run))
+    if left_out:
+        caption += f" {left_out} of {len(run.landmarks)} landmarks lie far outside the picture."
     return figure(map_plot(run), caption, legend_of(entries))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 CHI2_95 = 5.991464547107979
 """95 % quantile of chi square with two degrees of freedom: the square radius of an ellipse in a plane."""
@@ -118,6 +118,18 @@ class Axes:
         turned = f"rotate(-90 14 {number((y0 + y1) / 2)})"
         parts.append(text(14, (y0 + y1) / 2, ylabel, text_anchor="middle", class_="label", transform=turned))
         return group(parts, class_="frame")
+
+    def clip(self, parts: Iterable[str]) -> str:
+        """Elements of which only what lies inside the axes is shown."""
+        x, y = self.left, self.top
+        width, height = self.width - self.left - self.right, self.height - self.top - self.bottom
+        box = f"{number(x)} {number(y)} {number(width)} {number(height)}"
+        return element("svg", "".join(parts), x=number(x), y=number(y), width=number(width), height=number(height), viewBox=box)
+
+    def holds(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+        """Which points lie inside the axes."""
+        low, high = np.array([self.x[0], self.y[0]]), np.array([self.x[1], self.y[1]])
+        return np.all((xy >= low) & (xy <= high), axis=1)
 
     def ellipse(self, centre: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], **attributes: object) -> str:
         """The region of 95 % of a normal density, on axes of equal scale."""

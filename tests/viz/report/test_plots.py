@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from nolbo_ppl.viz.report import read_run
 from nolbo_ppl.viz.report.em import json_script
 from nolbo_ppl.viz.report.landmarks import RunAssociations
 from nolbo_ppl.viz.report.loops import Loop, find_loops, is_right, loop_scores
+from nolbo_ppl.viz.report.plots import map_axes, map_plot, outside
+from nolbo_ppl.viz.report.sections import world_map
 from nolbo_ppl.viz.report.shapes import render_shape
 from nolbo_ppl.viz.report.svg import Axes, element, equal_axes, round_ticks
 from nolbo_ppl.viz.report.text import figures_tables, say
@@ -162,3 +165,16 @@ def test_detections_whose_truth_is_not_trusted_are_not_judged(run_folder: Path, 
     assert before is not None and spoilt is not None and after is not None
     assert before["precision"] == after["precision"] == 1.0 and spoilt["precision"] < 0.7  # type: ignore[operator]
     assert after["found"] < before["found"]  # type: ignore[operator]
+
+
+def test_an_outlier_neither_shrinks_nor_covers_the_map(run_folder: Path) -> None:
+    run = read_run(run_folder)
+    plain = map_axes(run)
+    assert outside(run, plain) == 0
+    far = replace(run.landmarks[0], position=np.array([500.0, 0.0, 900.0]))
+    vague = replace(run.landmarks[1], position_covariance=np.diag([400.0, 1.0, 400.0]))
+    odd = replace(run, landmarks=(far, vague, *run.landmarks[2:]))
+    assert map_axes(odd).scale >= plain.scale and outside(odd, map_axes(odd)) == 1
+    drawn = map_plot(odd)
+    assert drawn.count('class="ellipse wide"') == 1 and drawn.count('class="ellipse"') == len(run.landmarks) - 1
+    assert "1 of 8 landmarks lie far outside the picture" in world_map(odd)
