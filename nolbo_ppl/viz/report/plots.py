@@ -178,9 +178,8 @@ def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
         tip += f"\n{kind}" if kind else ""
         parts.append(group([axes.line(corner, class_=f"loop {kind}", style=style, data_tip=tip)], data_layer=kind or "loops"))
     frame = axes.frame(axis_label(run, 0), axis_label(run, 1))
-    return picture(
-        axes, [frame, way_lines(run, axes, ("estimate",)), *parts, landmark_marks(run, axes, ellipses=False)], "Loop closures"
-    )
+    drawn = [frame, way_lines(run, axes, ("estimate",)), axes.clip(parts), landmark_marks(run, axes, ellipses=False)]
+    return picture(axes, drawn, "Loop closures")
 
 
 def clock(run: RunFolder) -> tuple[Float[np.ndarray, " n"], str]:
