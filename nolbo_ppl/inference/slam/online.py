@@ -247,6 +247,7 @@ class ObjectSlam:
         self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int
     ) -> None:
         """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
+        rows, landmarks = [], []
         for i, number in enumerate(assigned.tolist()):
             if number < 0:
                 continue
@@ -257,8 +258,11 @@ class ObjectSlam:
             if track.landmark < 0:
                 self._found(track, problem.observations, i)
                 for earlier, its_problem, its_noise, k in self.pending.pop(number, []):
-                    self.graph.observe(its_problem, its_noise, self.config, k, earlier, self.graph.pose(earlier), track.landmark)
-            self.graph.observe(problem, noise, self.config, i, frame, self.T_world_camera, track.landmark)
+                    pose = self.graph.pose(earlier)
+                    self.graph.observe(its_problem, its_noise, self.config, [k], earlier, pose, [track.landmark])
+            rows.append(i)
+            landmarks.append(track.landmark)
+        self.graph.observe(problem, noise, self.config, rows, frame, self.T_world_camera, landmarks)
         for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
             del self.pending[number]
 
@@ -273,7 +277,9 @@ class ObjectSlam:
     # -- answers ------------------------------------------------------------------------------------------------------
 
     def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
-        """All poses as iSAM2 has them now."""
+        """All poses as iSAM2 has them now, every loop found so far closed."""
+        if self.loops is not None:
+            self.loops.flush(self.graph)
         return self.graph.trajectory()
 
     def finish(self) -> SlamResult:

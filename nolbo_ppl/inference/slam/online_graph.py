@@ -22,13 +22,20 @@ from nolbo_ppl.inference.slam.graph import (
     resolve_observations,
 )
 
+RELINEARISE_ROTATION, RELINEARISE_POSITION = 0.05, 10.0
+"""Changes in rad and m beyond which a variable is linearised anew."""
+
 
 class OnlineGraph:
     """Factors and first values wait until `commit`; `pose` and `landmark` answer with what is known now."""
 
     def __init__(self) -> None:
         parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(0.05)
+        # Between-factors are linear in positions: only rotations that have moved need a new linearisation point.
+        thresholds = gtsam.ISAM2ThresholdMap()
+        for symbol in "xl":
+            thresholds.insert((symbol, np.repeat([RELINEARISE_ROTATION, RELINEARISE_POSITION], 3)))
+        parameters.setRelinearizeThreshold(thresholds)
         parameters.relinearizeSkip = 10
         # Landmarks hang on weak priors beside a nearly fixed first pose: QR takes that spread, Cholesky does not.
         parameters.setFactorization("QR")
@@ -62,20 +69,20 @@ class OnlineGraph:
         return self.landmarks - 1
 
     def observe(
-        self, problem: SlamProblem, noise: NoiseModel, config: SlamConfig, row: int, frame: int,
-        T_world_camera: Float[np.ndarray, "4 4"], landmark: int,
+        self, problem: SlamProblem, noise: NoiseModel, config: SlamConfig, rows: list[int], frame: int,
+        T_world_camera: Float[np.ndarray, "4 4"], landmarks: list[int],
     ) -> None:
-        """Factors of one detection of one keyframe (`problem` holds that keyframe alone)."""
-        estimate = Estimate(T_world_camera[None], self.landmark(landmark)[None])
-        factors = resolve_observations(problem, noise, config, estimate, np.array([row]), np.zeros(1, dtype=np.int64), np.ones(1))
-        factors = replace(factors, frame=np.full_like(factors.frame, frame),
-                          landmark=np.full_like(factors.landmark, landmark))
+        """Factors of detections of one keyframe (`problem` holds that keyframe alone)."""
+        if not rows:
+            return
+        estimate = Estimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
+        factors = resolve_observations(problem, noise, config, estimate, np.array(rows), np.arange(len(rows)), np.ones(len(rows)))
+        factors = replace(factors, frame=np.full_like(factors.frame, frame), landmark=np.array(landmarks)[factors.landmark])
         add_observation_factors(self.graph, factors)
 
-    def link(self, links: Links) -> None:
+    def add_links(self, links: Links) -> None:
         """Tie landmarks together; the linearisation points follow with the next keyframes."""
         add_links(self.graph, links, None)
-        self.commit()
 
     def commit(self) -> None:
         """Hand what waits to iSAM2.

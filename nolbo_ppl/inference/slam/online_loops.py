@@ -27,6 +27,8 @@ from nolbo_ppl.inference.slam.state_types import link_scale
 
 SURE = 0.9
 """Soft links above this weight are closed online; the rest waits for the end."""
+LINK_INTERVAL = 40
+"""Keyframes between two solves for closed loops: links found sooner wait. Such a solve costs twenty keyframes."""
 POPULATION = 300
 """Tracks the population of latents is taken from."""
 
@@ -65,6 +67,8 @@ class LoopCloser:
         self.fresh: list[int] = []
         self.links: list[tuple[int, int]] = []
         self.position = np.zeros((0, 3))
+        self.waiting: list[tuple[Links, list[tuple[int, int, np.ndarray, float]]]] = []
+        self.solved_at = -LINK_INTERVAL
 
     def add(self, track: Track) -> None:
         """A track that entered the graph as its next landmark."""
@@ -72,7 +76,9 @@ class LoopCloser:
         self.tracks.append(track)
 
     def close(self, frame: int, graph: OnlineGraph, noise: NoiseModel) -> int:
-        """Match the newest window of ended tracks once enough of them are new; returns the number of links added."""
+        """Match the newest window of ended tracks once enough of them are new; returns the number of links found."""
+        if frame - self.solved_at >= LINK_INTERVAL and self.flush(graph):
+            self.solved_at = frame
         ended = [j for j in self.fresh if frame - self.tracks[j].last > 1]
         half = max(self.config.constellation_size // 2, 1)
         if len(ended) < half:
@@ -92,8 +98,23 @@ class LoopCloser:
                            tracks, self.prior, self.config, self._links_among(near), floor=link_scale(noise),
                            new_rate=noise.new_rate)
         if found:
-            self._link(found, near, poses, features, graph, link_scale(noise))
+            self._link(found, near, poses, features, link_scale(noise))
+            if frame - self.solved_at >= LINK_INTERVAL and self.flush(graph):
+                self.solved_at = frame
         return len(found)
+
+    def flush(self, graph: OnlineGraph) -> bool:
+        """Put the links that wait into the graph and solve; whether there were any."""
+        if not self.waiting:
+            return False
+        for links, ties in self.waiting:
+            graph.add_links(links)
+            for tie in ties:
+                self.drift.close(*tie)
+        graph.commit()
+        self.waiting = []
+        self.position = np.zeros((0, 3))  # the map has moved
+        return True
 
     def _look_up(self, graph: OnlineGraph, window: Int[np.ndarray, " w"]) -> None:
         """Positions of landmarks new since the last time, and of the window; all of them after a closing has moved the map."""
@@ -143,17 +164,15 @@ class LoopCloser:
 
     def _link(
         self, found: list[tuple[int, int]], near: Int[np.ndarray, " c"], poses: Float[np.ndarray, "c 4 4"],
-        features: TrackletFeatures, graph: OnlineGraph, scale: float,
+        features: TrackletFeatures, scale: float,
     ) -> None:
         pairs = np.array(found, dtype=np.int64)
         links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
         a, b = near[pairs[:, 0]], near[pairs[:, 1]]
-        graph.link(Links(a, b, links.weight, links.T_a_b, links.scale))
-        for i, j, row in zip(a.tolist(), b.tolist(), pairs[:, 1]):
-            frames = middle_frames([self.tracks[i], self.tracks[j]])
-            self.drift.close(int(frames[0]), int(frames[1]), poses[row, :3, 3], 2 * scale)
+        middle = middle_frames(self.tracks)
+        ties = [(int(middle[i]), int(middle[j]), poses[row, :3, 3], 2 * scale) for i, j, row in zip(a, b, pairs[:, 1])]
+        self.waiting.append((Links(a, b, links.weight, links.T_a_b, links.scale), ties))
         self.links += list(zip(a.tolist(), b.tolist()))
-        self.position = np.zeros((0, 3))
 
 
 def middle_frames(tracks: list[Track]) -> Int[np.ndarray, " m"]:

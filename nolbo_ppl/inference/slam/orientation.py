@@ -8,6 +8,7 @@ splits a factor by the responsibilities of what is left of it (`resolve_modes`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -88,6 +89,7 @@ def observed_modes(
     return RotationModes(log_weight, R, scale)
 
 
+@cache
 def vertical_turns(order: int) -> Float[np.ndarray, "g 3 3"]:
     """Rotations about the object's vertical axis that an n-fold symmetry cannot tell apart, and their half turns."""
     order = min(max(order, 1), _MAXIMUM_ORDER)
