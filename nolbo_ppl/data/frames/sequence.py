@@ -101,7 +101,7 @@ def read_column(path: str | PathLike[str], what: str) -> list[tuple[int, float]]
             raise input_error(f"not {what}", got=repr(" ".join(words)[:80]), expected="one number", file=path, line=number)
         rows.append((number, values[0]))
     if not rows:
-        raise input_error(f"no {what} in the file", file=path)
+        raise input_error("the file is empty", expected=f"{what} a line", file=path)
     return rows
 
 

@@ -33,7 +33,7 @@ class OdometryConfig:
 
     detector: Literal["orb", "sift"] = "orb"
     """Features: ORB is faster, SIFT more accurate and three times slower."""
-    features: int = 700
+    features: int = 500
     """Features an image, at most."""
     fast_threshold: int = 5
     """Least contrast of an ORB corner in grey values; small, since small images of plain surfaces have few corners."""
@@ -47,8 +47,11 @@ class OdometryConfig:
     """Ratio test: a match is this much nearer than the second best (Lowe 2004)."""
     largest_shift: float = 0.25
     """Matches further apart than this part of the image's diagonal are dropped."""
-    patch: int = 11
-    """Side of the patches that are registered to place matches below a pixel; 0 takes the corners as they are."""
+    patch: int = 0
+    """Side of the patches that are registered to place matches below a pixel; 0 takes the corners as they are.
+
+    The paper's odometry is weak on purpose, and so is this default. With 11 px the drift is three times smaller.
+    """
     threshold: float = 1.0
     """Inlier threshold of the essential matrix, px."""
     confidence: float = 0.999
@@ -67,8 +70,12 @@ class OdometryConfig:
     """Standard deviation of each angle of a repeated step, rad."""
     lost_translation_ratio: float = 0.5
     """The same for its translation, in parts of its length."""
-    inflation: float = 1.0
-    """Factor on the standard deviations that follow from the residuals alone."""
+    inflation: float = 2.0
+    """Factor on the standard deviations that follow from the residuals alone.
+
+    Exact on simulated points with 1. On images errors of neighbouring corners go together: normalised squared errors
+    of steps have medians of 14 to 28 there, where six degrees of freedom would give 5.3.
+    """
 
     def __post_init__(self) -> None:
         positive = ("features", "fast_threshold", "levels", "cell", "threshold", "iterations", "inflation",

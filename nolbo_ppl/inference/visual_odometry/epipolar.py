@@ -23,6 +23,8 @@ LEAST_SCALE = 0.02
 """Least standard deviation of a corner, px: synthetic images can fit to rounding."""
 LEVERAGE = 3.0
 """A match pulls at the direction of translation at most so many times as much as the usual one."""
+HALVINGS = 4
+"""How often a step that raises the loss is cut to a quarter before it is given up."""
 MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
 
@@ -73,17 +75,31 @@ def sampson(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 5"]]:
     """Signed Sampson residuals in px and their Jacobian by [rotation, direction] (Hartley and Zisserman 2004, eq. 11.9).
 
-    A residual has the standard deviation of one coordinate of a corner. The Jacobian leaves out that of the
-    denominator: exact where the residual is zero.
+    A residual has the standard deviation of one coordinate of a corner. The derivative of the denominator belongs to the
+    Jacobian: without it the translation wanders into the image, where epipolar lines are short.
     """
     E = skew(direction) @ R
+    basis = tangent(direction)
+    turned = second @ R.T
     line_first, line_second = second @ E.T, first @ E  # E x2, E' x1
     error = np.sum(first * line_first, axis=1)
     gradient = np.concatenate([line_first[:, :2], line_second[:, :2]], axis=1) / np.tile(intrinsics[:2], 2)
     norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
-    by_rotation = cross(second, line_second)  # d(x1' [t]x R [w]x x2) = w . (x2 x E'x1)
-    by_direction = cross(second @ R.T, first) @ tangent(direction)  # x1' [t]x R x2 = t . (R x2 x x1)
-    return error / norm, np.concatenate([by_rotation, by_direction], axis=1) / norm[:, None]
+    # With R Exp(w) and t + B b: x1' [t]x R (w x x2) = w . (x2 x E'x1) and x1' (B b x R x2) = b . B' (R x2 x x1).
+    by_parameter = np.concatenate([cross(second, line_second), cross(turned, first) @ basis], axis=1)
+    slopes = np.empty((len(first), 4, 5))
+    for axis in range(3):
+        turn = np.zeros(3)
+        turn[axis] = 1.0
+        slopes[:, :2, axis] = (cross(turn, second) @ E.T)[:, :2]
+        slopes[:, 2:, axis] = cross(line_second, turn)[:, :2]
+    for axis in range(2):
+        slopes[:, :2, 3 + axis] = cross(basis[:, axis], turned)[:, :2]
+        slopes[:, 2:, 3 + axis] = (cross(first, basis[:, axis]) @ R)[:, :2]
+    pull = gradient / np.tile(intrinsics[:2], 2)
+    by_norm = np.einsum("mk,mkp->mp", pull, slopes) / norm[:, None]
+    residual = error / norm
+    return residual, (by_parameter - residual[:, None] * by_norm) / norm[:, None]
 
 
 def depths(
@@ -106,6 +122,11 @@ def depths(
 def student_weights(residual: Float[np.ndarray, " m"], scale: float) -> Float[np.ndarray, " m"]:
     """Weights of Student's t for residuals in units of `scale`."""
     return (FREEDOM + 1.0) / (FREEDOM + (residual / scale) ** 2)
+
+
+def student_loss(residual: Float[np.ndarray, " m"], scale: float) -> Float[np.ndarray, " m"]:
+    """The loss those weights belong to, up to a constant, nats."""
+    return 0.5 * (FREEDOM + 1.0) * np.log1p((residual / scale) ** 2 / FREEDOM)
 
 
 def leverage_weights(jacobian: Float[np.ndarray, "m 5"], inside: Bool[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
@@ -140,16 +161,26 @@ def refine(
         if inside.sum() < 8:
             break
         scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE)
-        weight = np.where(inside, student_weights(residual, scale), 0.0) * leverage_weights(jacobian, inside)
+        leverage = leverage_weights(jacobian, inside) * inside
+        weight = student_weights(residual, scale) * leverage
         normal = (jacobian * weight[:, None]).T @ jacobian
         # Along a direction nobody measures the step must stay small, not blow up.
         step = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(5), jacobian.T @ (weight * residual))
         step *= min(1.0, 0.2 / max(float(np.abs(step).max()), 1e-12))
-        R = R @ so3_exp(step[:3])
-        direction = direction + tangent(direction) @ step[3:]
-        direction = direction / np.linalg.norm(direction)
-        limit = min(threshold * 2.0, max(GATE * scale, 0.1 * threshold))
-        residual, jacobian = sampson(R, direction, first, second, intrinsics)
+        before = student_loss(residual, scale) @ leverage
+        for _ in range(HALVINGS):
+            trial_R = R @ so3_exp(step[:3])
+            trial = direction + tangent(direction) @ step[3:]
+            trial /= np.linalg.norm(trial)
+            residual, jacobian = sampson(trial_R, trial, first, second, intrinsics)
+            if student_loss(residual, scale) @ leverage <= before:
+                break
+            step = 0.25 * step
+        else:
+            residual, jacobian = sampson(R, direction, first, second, intrinsics)
+            break
+        R, direction = trial_R, trial
+        limit = min(2.0 * threshold, max(GATE * scale, 0.1 * threshold))
         if np.abs(step).max() < 1e-5:
             break
     inside = np.abs(residual) < limit

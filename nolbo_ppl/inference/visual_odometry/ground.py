@@ -13,9 +13,11 @@ from jaxtyping import Float
 from nolbo_ppl.inference.visual_odometry.config import GroundHeight
 from nolbo_ppl.inference.visual_odometry.epipolar import TwoView, cross, depths, student_weights
 
-BELOW_HORIZON = 0.06
+BELOW_HORIZON = 0.1
 """Points on the ground lie at least this slope below the horizon."""
-TILT = 0.03
+ASIDE = 2.0
+"""And no further to the side than so many camera heights: walls and hedges stand there."""
+TILT = 0.01
 """Standard deviation of the ground's slope against the horizontal of the camera, rad."""
 LEAST_POINTS = 12
 """Fewer points make no ground."""
@@ -72,7 +74,7 @@ def fit_ground(
     first, second = first[view.inliers], second[view.inliers]
     slopes = first @ ground_axes(pitch)
     rho = depths(view.R, view.direction, first, second)[:, 0]
-    below = (slopes[:, 0] > BELOW_HORIZON) & (rho > 0)
+    below = (slopes[:, 0] > BELOW_HORIZON) & (np.abs(slopes[:, 1]) < ASIDE * slopes[:, 0]) & (rho > 0)
     if below.sum() < LEAST_POINTS:
         return None
     slopes, rho = slopes[below], rho[below]

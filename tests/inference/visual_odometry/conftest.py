@@ -12,7 +12,7 @@ from nolbo_ppl.geometry.pose import make_pose, so3_exp
 
 INTRINSICS = np.array([200.0, 200.0, 192.0, 96.0])
 HEIGHT, WIDTH = 192, 384
-SUPER = 3
+SUPER = 2
 CAMERA_HEIGHT = 1.5
 
 
@@ -42,9 +42,9 @@ class Room:
     def frame(self, k: int, /) -> np.ndarray:
         """The image of a pose: nearest plane along each ray, texture looked up, a little noise."""
         T = self.T_world_camera[k]
-        v, u = (np.mgrid[0 : SUPER * HEIGHT, 0 : SUPER * WIDTH].astype(np.float64) + 0.5) / SUPER
+        v, u = (np.mgrid[0 : SUPER * HEIGHT, 0 : SUPER * WIDTH].astype(np.float32) + np.float32(0.5)) / SUPER
         ray = np.stack([(u - INTRINSICS[2]) / INTRINSICS[0], (v - INTRINSICS[3]) / INTRINSICS[1], np.ones_like(u)], -1)
-        ray = ray @ T[:3, :3].T
+        ray = (ray @ T[:3, :3].T).astype(np.float32)
         origin = T[:3, 3]
         planes = [(0, self.half[0]), (0, -self.half[0]), (1, CAMERA_HEIGHT), (1, -4.0), (2, self.half[1]), (2, -self.half[1])]
         nearest = np.full(u.shape, np.inf)
@@ -84,4 +84,4 @@ def weaving(steps: int, length: float, turn: float) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def room() -> Room:
-    return make_room(weaving(39, 0.4, 0.03))
+    return make_room(weaving(17, 0.4, 0.03))

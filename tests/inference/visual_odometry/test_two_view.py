@@ -75,10 +75,10 @@ def measured(first: np.ndarray, second: np.ndarray, scale: KnownLengths | Ground
 def test_the_jacobian_of_sampson_residuals_is_their_derivative() -> None:
     rng = np.random.default_rng(0)
     T = random_step(rng)
-    first, second = (rays(p, INTRINSICS) for p in views(rng, T, 50, 0.0))
+    first, second = (rays(p, INTRINSICS) for p in views(rng, T, 50, 3.0))
     R, u = T[:3, :3], T[:3, 3] / np.linalg.norm(T[:3, 3])
     residual, jacobian = sampson(R, u, first, second, INTRINSICS)
-    np.testing.assert_allclose(residual, 0, atol=1e-9)  # only there is the denominator's derivative without effect
+    assert np.abs(residual).max() > 3
     for axis in range(5):
         delta = np.zeros(5)
         delta[axis] = 1e-6
@@ -144,7 +144,7 @@ def test_motion_is_found_among_wrong_matches(wrong: int) -> None:
 
 def test_covariance_is_that_of_the_errors() -> None:
     """Normalised squared errors of a step with a noisy wheel have mean 6: chi-squared with six degrees of freedom."""
-    runs, ratio = 200, 0.02
+    runs, ratio = 120, 0.02
     squares = []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
@@ -161,7 +161,7 @@ def test_covariance_is_that_of_the_errors() -> None:
 
 def test_a_turn_on_the_spot_is_flagged_and_measured() -> None:
     squares = []
-    for seed in range(100):
+    for seed in range(50):
         rng = np.random.default_rng(seed)
         T = se3_exp(np.array([0.0, 0.08, 0.01, 0, 0, 0]))
         first, second = views(rng, T, 300, 0.3, wrong=20)
@@ -171,7 +171,7 @@ def test_a_turn_on_the_spot_is_flagged_and_measured() -> None:
         assert np.linalg.norm(error[:3]) < 2e-3 and np.linalg.norm(error[3:]) < 1e-9
         squares.append(error[:3] @ np.linalg.solve(step.covariance[:3, :3], error[:3]))
     # Three degrees of freedom; weighting by Student's t and wrong matches cost a little.
-    assert 3 - 5 * np.sqrt(6 / 100) < np.mean(squares) < 1.5 * (3 + 5 * np.sqrt(6 / 100))
+    assert 3 - 5 * np.sqrt(6 / 50) < np.mean(squares) < 1.5 * (3 + 5 * np.sqrt(6 / 50))
 
 
 def test_rotation_alone_is_exact_without_noise() -> None:
@@ -213,14 +213,14 @@ def test_matches_of_nothing_repeat_the_step_before() -> None:
 
 def test_the_ground_gives_the_length() -> None:
     errors, scales = [], []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         T = random_step(rng)
         first, second = views(rng, T, 400, 0.2)
         view = two_view(first, second, INTRINSICS, OdometryConfig())
         assert view is not None
         ground = fit_ground(view, rays(first, INTRINSICS), rays(second, INTRINSICS), INTRINSICS, 0.0)
-        assert ground is not None and ground.points > 50
+        assert ground is not None and ground.points > 25
         errors.append(CAMERA_HEIGHT * ground.inverse_height / 0.8 - 1)
         scales.append(ground.scale / ground.inverse_height)
     assert abs(np.mean(errors)) < 0.01
