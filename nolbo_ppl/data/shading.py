@@ -125,13 +125,13 @@ def surfaces(
                 points[i, 0], points[i, 1], points[i, 2] = x * z, y * z, z
                 normals[i] = -wall_normal
                 kind[i] = WALL
-                _plane_albedo(wall, points[i], normals[i], up, focal, albedo[i])
+                _plane_albedo(wall, points[i], normals[i], up, focal, albedo[i])  # type: ignore[arg-type]
                 continue
         if distance < np.inf:
             points[i, 0], points[i, 1], points[i, 2] = x * distance, y * distance, distance
             normals[i] = up
             kind[i] = GROUND
-            _plane_albedo(ground, points[i], up, north, focal, albedo[i])
+            _plane_albedo(ground, points[i], up, north, focal, albedo[i])  # type: ignore[arg-type]
     return points, normals, albedo, kind
 
 
