@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +35,14 @@ class Arguments:
 
 
 def make_drive(data: Path, every: int, seed: int, frames: int | None = None) -> tuple[Drive, SlamConfig]:
-    """KITTI 00 with 400 objects of 20 categories; noise per metre does not depend on `every`."""
-    truth = read_trajectory(data / "kitti_odometry" / "poses" / "00.txt").T_world_camera[::every][:frames]
+    """KITTI 00 with 400 objects of 20 categories, cut to its first frames; noise per metre does not depend on `every`."""
+    truth = read_trajectory(data / "kitti_odometry" / "poses" / "00.txt").T_world_camera[::every]
     rotation = 0.008 * np.sqrt(every / 5)
     drive = simulate_drive(truth, np.random.default_rng(seed), odometry_rotation_scale=rotation,
                            odometry_translation_ratio=0.01, detector=DetectorConfig(maximum_range=30.0))
+    early = drive.observations.frame < (frames or len(truth))
+    drive = replace(drive, truth=drive.truth[:frames], odometry=drive.odometry[:frames], object_of=drive.object_of[early],
+                    observations=drive.observations.select(early))
     return drive, SlamConfig(odometry_rotation_scale=rotation, odometry_translation_ratio=0.01)
 
 
