@@ -57,10 +57,10 @@ def finished(known: SimulatedDrive, tmp_path_factory: pytest.TempPathFactory) ->
 def test_every_file_is_written_and_the_loop_is_closed(known: SimulatedDrive, finished: Path) -> None:
     assert {path.name for path in finished.iterdir()} == FILES
     assert {"trajectory.txt", "landmarks.json", "associations.jsonl", "iterations.npz", "landmarks_voxels.npz", "map.png",
-            "summary.json"} == {path.name for path in (finished / "slam").iterdir()}  # fmt: skip
+            "noise.npz", "summary.json"} == {path.name for path in (finished / "slam").iterdir()}  # fmt: skip
     summary = read_json(finished / "summary.json")
     assert summary["frames"] == 120 and summary["after"]["ate"] < 0.4 * summary["before"]["ate"]
-    assert summary["after_over_oracle"] < 2 and summary["after_over_before"] == pytest.approx(
+    assert 0.5 < summary["after_over_oracle"] < 2 and summary["after_over_before"] == pytest.approx(
         summary["after"]["ate"] / summary["before"]["ate"], abs=1e-5)  # fmt: skip
     # At the image's border some detections are of objects that the truth just left out: they are not held to be theirs.
     assert summary["loops"]["precision"] > 0.9 and summary["loops"]["recall"] > 0.9

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ class DemoResult:
 def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1) -> DemoResult:
     """Render a small street drive into `out/drive` and run it into `out/run`; what is there already is not made again.
 
-    Visual odometry has the lengths of its steps from the truth, as a wheel would tell them (NOLBO, experiments: known scale).
+    Visual odometry has the lengths of its steps from the ground under the camera, so that nothing of the truth enters the map.
 
     Args:
         out: folder.
@@ -50,11 +51,12 @@ def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1)
     from nolbo_ppl.data.drive import drive_preset, write_drive  # brings the renderer
 
     drive, run = out / "drive", out / "run"
-    write_drive(drive_preset("demo", "street", DEMO_SEED + seed), drive, workers)
+    world = drive_preset("demo", "street", DEMO_SEED + seed)
+    write_drive(world, drive, workers)
     summary = run_mission(
         RunConfig(
             images=drive / "images", intrinsics=drive / "intrinsics.json", truth=drive / "truth.txt", truth_objects=drive,
-            out=run, model=model, seed=seed,
+            out=run, model=model, seed=seed, camera_height=world.camera_height, camera_pitch=math.radians(world.tilt),
         )
     )  # fmt: skip
     return DemoResult(figure_table(summary), summary, drive, run)

@@ -26,6 +26,7 @@ from nolbo_ppl.io import atomic_path, read_json, read_jsonl, write_json, write_j
 from nolbo_ppl.mission.config import RunConfig
 from nolbo_ppl.mission.crops import best_views, write_crops
 from nolbo_ppl.mission.depth import DepthScale
+from nolbo_ppl.mission.noise import write_noise
 from nolbo_ppl.mission.observe import (
     DepthPictures,
     DepthSource,
@@ -137,6 +138,7 @@ class Mission:
         """EM: trajectory, landmarks, associations, decoded shapes, where every iteration stood."""
         config, problem = self.config, self.problem
         result: SlamResult = solve_online(problem, config.slam) if config.online else solve(problem, config.slam)
+        write_noise(self.out / "slam" / "noise.npz", result.state.noise)
         write_result(self.out / "slam", result, Trajectory(problem.odometry), self.truth, model=self.model)
 
     def map(self) -> None:

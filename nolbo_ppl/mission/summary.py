@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.data.observations import ObservationTable, read_observations
 from nolbo_ppl.data.trajectories import read_trajectory
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
+from nolbo_ppl.inference.slam import NoiseModel, SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.inference.slam.export import trajectory_errors
 from nolbo_ppl.io import read_json, read_jsonl
 from nolbo_ppl.metrics.trajectory import path_length
@@ -29,6 +29,7 @@ from nolbo_ppl.mission.figures import (
     position_figures,
     shape_figures,
 )
+from nolbo_ppl.mission.noise import read_noise
 from nolbo_ppl.mission.scene import stands
 from nolbo_ppl.mission.truth import DriveTruth, Matched, match_detections, read_truth
 
@@ -60,6 +61,8 @@ class RunResult:
     """Landmark that has more than half of each observation's weight, -1 for none."""
     slam: Mapping[str, Any]
     """`slam/summary.json`."""
+    noise: NoiseModel
+    """The noise the EM has settled on."""
     images: tuple[str, ...]
     """Names of the keyframes' images."""
 
@@ -100,6 +103,7 @@ def read_result(folder: Path) -> RunResult:
         landmarks=landmarks,
         landmark_of=landmark_of,
         slam=read_json(folder / "slam" / "summary.json"),
+        noise=read_noise(folder / "slam" / "noise.npz"),
         images=tuple(str(row["image"]) for _, row in read_jsonl(folder / "frames.jsonl")),
     )
 
@@ -117,9 +121,10 @@ def trajectory_figures(result: RunResult) -> dict[str, Any]:
 def oracle_figures(
     result: RunResult, problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig
 ) -> dict[str, Any]:
-    """Errors of the same detections associated by the truth: what is left to the association, and what is not."""
+    """Errors of the same detections under the same noise, associated by the truth: what is left to the association."""
     assert result.truth is not None
-    oracle = trajectory_errors(solve_with_associations(problem, object_of, config).estimate.T_world_camera, result.truth)
+    state = solve_with_associations(problem, object_of, config, result.noise)
+    oracle = trajectory_errors(state.estimate.T_world_camera, result.truth)
     after = trajectory_errors(result.estimate, result.truth)["ate"]
     return {"oracle": oracle, "after_over_oracle": finite(after / oracle["ate"]) if oracle["ate"] > 0 else None}
 
