@@ -57,7 +57,7 @@ class EvaluateConfig:
     """Folder of photographs behind generated scenes."""
     sizes: tuple[int, ...] = ()
     """Longer sides, px, images are brought to; the network's own size by default. With several, each answers for the
-    objects it shows at a trained size: `320 960` for street images 1242 px wide."""
+    objects it shows at a trained size: `256 640` for street images 1242 px wide."""
     retrieval: bool = False
     """Measure too whether the shape latent tells instances of a category apart, from other views in other light."""
     gallery: int = 100
