@@ -41,6 +41,9 @@ class ObserveConfig:
     """Images that go through the network at once."""
     seed: int = 0
     """Seed of the samples behind the voxels' mean and variance."""
+    size: int | None = None
+    """Longer side, px, at which the network looks at each image, a multiple of 32; its own by default. Larger for wide
+    images whose objects would else be too small."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def _rows(config: ObserveConfig, paths: list[Path], model: ObservationModel) -> 
             part = paths[first : first + config.batch]
             images = [read_image(path) for path in part]
             observed = model.observe(
-                images, config.intrinsics, threshold=config.threshold, batch=config.batch, seed=config.seed
+                images, config.intrinsics, threshold=config.threshold, size=config.size, batch=config.batch, seed=config.seed
             )
             for offset, (path, image, observations) in enumerate(zip(part, images, observed)):
                 yield from observations.rows(first + offset, path.name)

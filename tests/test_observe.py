@@ -130,6 +130,16 @@ def test_batches_do_not_change_the_answers(model: Path, images: Path, tmp_path: 
         np.testing.assert_allclose(one["position"], three["position"], rtol=1e-3)
 
 
+def test_a_larger_size_sees_other_cells(model: Path, images: Path, tmp_path: Path) -> None:
+    """`--size` reaches the network: as many cells as a picture of that size has."""
+    config = ObserveConfig(images, tmp_path / "large", str(model), threshold=0.01, pictures=False, size=128)
+    small = ObserveConfig(images, tmp_path / "small", str(model), threshold=0.01, pictures=False)
+    boxes = [[row["box"] for _, row in read_jsonl(run(one).file)] for one in (config, small)]
+    assert boxes[0] != boxes[1]
+    with pytest.raises(InputError, match="multiple of 32"):
+        run(ObserveConfig(images, tmp_path / "odd", str(model), size=100))
+
+
 def test_a_damaged_picture_is_named_and_leaves_no_observations(model: Path, tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
