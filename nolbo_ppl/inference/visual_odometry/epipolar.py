@@ -23,6 +23,10 @@ LEAST_SCALE = 0.02
 """Least standard deviation of a corner, px: synthetic images can fit to rounding."""
 LEVERAGE = 3.0
 """A match pulls at the direction of translation at most so many times as much as the usual one."""
+GENERATORS = skew(np.eye(3))
+"""`w x a` for the three axes w."""
+DIRECTION_SCALE, DIRECTION_BOUND = 0.15, 12.0
+"""How far the direction of translation turns from step to step, rad, and the most that is held against another, nats."""
 HALVINGS = 4
 """How often a step that raises the loss is cut to a quarter before it is given up."""
 MAD = 1.4826
@@ -69,6 +73,14 @@ def tangent(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 2"]:
     return np.column_stack([first, cross(direction, first)])
 
 
+def rowwise(
+    points: Float[np.ndarray, "m 3"], maps: Float[np.ndarray, "p 2 3"], pull: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, "m p"]:
+    """`pull . (map x)` for each point x and each map, in one product of matrices."""
+    moved = points @ maps.reshape(-1, 3).T
+    return moved[:, 0::2] * pull[:, :1] + moved[:, 1::2] * pull[:, 1:]
+
+
 def sampson(
     R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
     second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"],
@@ -87,17 +99,12 @@ def sampson(
     norm = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
     # With R Exp(w) and t + B b: x1' [t]x R (w x x2) = w . (x2 x E'x1) and x1' (B b x R x2) = b . B' (R x2 x x1).
     by_parameter = np.concatenate([cross(second, line_second), cross(turned, first) @ basis], axis=1)
-    slopes = np.empty((len(first), 4, 5))
-    for axis in range(3):
-        turn = np.zeros(3)
-        turn[axis] = 1.0
-        slopes[:, :2, axis] = (cross(turn, second) @ E.T)[:, :2]
-        slopes[:, 2:, axis] = cross(line_second, turn)[:, :2]
-    for axis in range(2):
-        slopes[:, :2, 3 + axis] = cross(basis[:, axis], turned)[:, :2]
-        slopes[:, 2:, 3 + axis] = (cross(first, basis[:, axis]) @ R)[:, :2]
-    pull = gradient / np.tile(intrinsics[:2], 2)
-    by_norm = np.einsum("mk,mkp->mp", pull, slopes) / norm[:, None]
+    # The lines are linear in each parameter: E (w x x2), E'x1 x w, B b x R x2 and R' (x1 x B b), the first two rows of each.
+    pull = gradient / np.tile(intrinsics[:2], 2) / norm[:, None]
+    across = skew(basis.T)
+    by_norm = np.empty_like(by_parameter)
+    by_norm[:, :3] = rowwise(second, E[:2] @ GENERATORS, pull[:, :2]) - rowwise(line_second, GENERATORS[:, :2], pull[:, 2:])
+    by_norm[:, 3:] = rowwise(turned, across[:, :2], pull[:, :2]) - rowwise(first, R.T[:2] @ across, pull[:, 2:])
     residual = error / norm
     return residual, (by_parameter - residual[:, None] * by_norm) / norm[:, None]
 
@@ -148,14 +155,14 @@ def robust_cost(residual: Float[np.ndarray, " m"], threshold: float) -> float:
 
 def refine(
     R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
-    second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"], threshold: float, iterations: int = 12,
+    second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"], threshold: float, iterations: int = 10,
 ) -> TwoView:
     """Iteratively reweighted Gauss-Newton on the Sampson residuals from a first guess.
 
-    Inliers start at `threshold` px and follow the scale of the residuals, `GATE` times its robust estimate.
+    Inliers follow the scale of the residuals, `GATE` times its robust estimate, and end within twice `threshold` px.
     """
     residual, jacobian = sampson(R, direction, first, second, intrinsics)
-    limit = threshold
+    limit = max(threshold, GATE * MAD * float(np.median(np.abs(residual))))  # a first guess may be pixels off
     for _ in range(iterations):
         inside = np.abs(residual) < limit
         if inside.sum() < 8:
@@ -181,7 +188,7 @@ def refine(
             break
         R, direction = trial_R, trial
         limit = min(2.0 * threshold, max(GATE * scale, 0.1 * threshold))
-        if np.abs(step).max() < 1e-5:
+        if np.abs(step).max() < 3e-5:
             break
     inside = np.abs(residual) < limit
     scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE) if inside.any() else threshold
@@ -239,9 +246,13 @@ def two_view(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"],
     config: OdometryConfig, guess: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None = None,
 ) -> TwoView | None:
-    """Motion between two views by RANSAC and refinement; `guess`, the step before, competes as a second start.
+    """Motion between two views by RANSAC and refinement.
 
-    None where there are too few matches or inliers.
+    Few or poor matches often fit two motions that lie far apart. A `guess` of rotation and direction competes as a second
+    start, and motions are compared by their loss with a bounded prior about its direction.
+
+    Returns:
+        The better motion; None where there are too few matches or inliers.
     """
     if len(first) < config.least_inliers:
         return None
@@ -258,7 +269,17 @@ def two_view(
             view = TwoView(view.R, direction, mirrored(view.covariance, direction), view.inliers, view.scale, view.cost)
         candidates.append(view)
     good = [view for view in candidates if view.inliers.sum() >= config.least_inliers]
-    return min(good, key=lambda view: view.cost) if good else None
+    if not good:
+        return None
+    return min(good, key=lambda view: 2.0 * len(first) * view.cost + direction_penalty(view, guess))
+
+
+def direction_penalty(view: TwoView, guess: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None) -> float:
+    """Surprise at the direction of a motion after that of the step before, nats; bounded, so that clear images decide."""
+    if guess is None:
+        return 0.0
+    angle = float(np.arccos(np.clip(view.direction @ guess[1], -1.0, 1.0)))
+    return min(0.5 * (angle / DIRECTION_SCALE) ** 2, DIRECTION_BOUND)
 
 
 def mirrored(covariance: Float[np.ndarray, "5 5"], direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "5 5"]:

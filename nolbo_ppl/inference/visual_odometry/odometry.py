@@ -70,8 +70,6 @@ class OdometryState:
     """The step before, T_earlier_later."""
     direction: Float[np.ndarray, " 3"] | None = None
     """Direction of the last translation that was measured."""
-    measured: bool = False
-    """Whether the step before was."""
     length: LengthBelief | None = None
     """Length of the step before, where the ground gives the scale."""
 
@@ -205,12 +203,12 @@ def motion(
         return repeated_step(setup, state, len(first)), state.length
     ray_first, ray_second = rays(first, setup.intrinsics), rays(second, setup.intrinsics)
     still = float(np.median(np.linalg.norm(first - second, axis=1))) < config.still_shift
-    guess = None
-    if state.measured and state.step is not None and state.direction is not None:
-        guess = state.step[:3, :3], state.direction
+    R, covariance, scale = rotation_only(ray_first, ray_second, setup.intrinsics, config.threshold)
+    guess = None if state.direction is None else (R, state.direction)
     view = None if still else two_view(first, second, setup.intrinsics, config, guess)
     kept = np.ones(len(first), dtype=bool) if view is None else view.inliers
-    R, covariance, scale = rotation_only(ray_first[kept], ray_second[kept], setup.intrinsics, config.threshold)
+    if view is not None:
+        R, covariance, scale = rotation_only(ray_first[kept], ray_second[kept], setup.intrinsics, config.threshold)
     if still:
         return turning_step(setup, state, R, covariance, len(first), StepFlag.STILL), state.length
     noise = scale if view is None else view.scale
@@ -248,7 +246,7 @@ def step(
     if measured and np.linalg.norm(translation) > 0:
         direction = translation / np.linalg.norm(translation)
     pose = chain(state.T_world_camera, taken.T_earlier_later[None])[1]
-    after = OdometryState(state.frame + 1, pose, picture, features, taken.T_earlier_later, direction, measured, length)
+    after = OdometryState(state.frame + 1, pose, picture, features, taken.T_earlier_later, direction, length)
     return after, taken
 
 
