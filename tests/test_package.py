@@ -26,7 +26,8 @@ LAYERS = (
     ("inference",),
     ("data", "viz"),
     ("inference.slam",),
-    ("scenes", "train", "evaluate", "observe", "convert", "slam", "demo"),
+    ("mission",),
+    ("scenes", "train", "evaluate", "observe", "convert", "slam", "demo", "drive", "odometry", "run", "report", "view"),
     ("cli",),
 )
 """From the bottom up: a module imports from its own layer and those before it. SLAM reads the tables of `data`."""
