@@ -154,6 +154,8 @@ class Observations:
         quaternion = matrix_to_quaternion(torch.from_numpy(np.array(self.R_camera_object, dtype=np.float64))).numpy()
         modes = self.rotation_modes()
         mode_quaternion = matrix_to_quaternion(torch.from_numpy(modes.R_camera_object)).numpy()
+        kept = modes.weights >= LEAST_WEIGHT
+        weights = modes.weights / np.sum(modes.weights, axis=1, where=kept, keepdims=True)
         for i, category in enumerate(self.category):
             yield {
                 "frame": frame,
@@ -169,8 +171,7 @@ class Observations:
                 "rotation_std": round(float(self.rotation_scale[i]), 5),
                 "rotation_modes": [
                     {"weight": round(float(w), 5), "rotation": _rounded(q, 8), "std": round(float(s), 5)}
-                    for w, q, s in zip(modes.weights[i], mode_quaternion[i], modes.scale[i])
-                    if w >= LEAST_WEIGHT
+                    for w, q, s in zip(weights[i][kept[i]], mode_quaternion[i][kept[i]], modes.scale[i][kept[i]])
                 ],
                 "viewpoint": _rounded(self.viewpoint[i], 5),
                 "azimuth_modes": [
