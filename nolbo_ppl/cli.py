@@ -15,7 +15,7 @@ VERBS = {
     "train": "train an observation model",
     "evaluate": "measure a model on unseen scenes",
     "observe": "posteriors of the objects in a folder of images",
-    "convert": "bring real data into the formats of slam",
+    "convert": "bring real data into the formats of slam and evaluate",
     "slam": "correct a trajectory and map objects, from odometry and observations",
     "drive": "write a drive through a generated world: images, poses, objects",
     "odometry": "visual odometry of an image sequence",
