@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # One thread a process: torch's OpenMP threads spin and slow each other down on busy or small machines.
 TEST_WORKERS ?= 2
 
-.PHONY: setup demo train test lint bench clean
+.PHONY: setup demo train test lint bench docs clean
 
 setup: $(STAMP)
 
@@ -32,6 +32,9 @@ lint: $(STAMP)
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/observation.py --out build/observation.json
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/association.py --out build/association.json
+
+docs: $(STAMP)
+	OMP_NUM_THREADS=1 NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf build dist site demo runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
