@@ -23,6 +23,8 @@ FIRST_LENGTH = 0.1
 """Scale of the translation of a step that cannot be measured when no step before it was, m."""
 LARGEST_CORRECTION = 3.0
 """A match that its patch moves further is dropped, px."""
+HIDDEN_PARALLAX = 2.0
+"""Parallax that a step taken for a rotation may hold, in standard deviations of its residuals."""
 FORWARD = np.array([0.0, 0.0, 1.0])
 
 
@@ -164,12 +166,18 @@ def repeated_step(setup: VisualOdometry, state: OdometryState, matches: int) -> 
 
 def turning_step(
     setup: VisualOdometry, state: OdometryState, R: Float[np.ndarray, "3 3"], covariance: Float[np.ndarray, "3 3"],
-    matches: int, flags: StepFlag,
+    noise: float, matches: int, flags: StepFlag,
 ) -> Step:
-    """A step whose rotation alone is measured."""
+    """A step whose rotation alone is measured, `noise` px being the scale of its residuals.
+
+    Translation along the image that all points share looks like rotation: where the camera may have moved, about as much
+    of it as the residuals hide is added.
+    """
     translation, scale = guessed_translation(setup, state, moving=False)
+    at_rest = isinstance(setup.scale, KnownLengths) and setup.scale.lengths[state.frame] <= setup.scale.floor
+    hidden = 0.0 if at_rest else HIDDEN_PARALLAX * noise / float(np.sqrt(setup.intrinsics[0] * setup.intrinsics[1]))
     full = np.zeros((6, 6))
-    full[:3, :3], full[3:, 3:] = covariance * setup.config.inflation**2, scale**2 * np.eye(3)
+    full[:3, :3], full[3:, 3:] = covariance * setup.config.inflation**2 + hidden**2 * np.eye(3), scale**2 * np.eye(3)
     return Step(make_pose(R, translation), floored(full), matches, matches, flags)
 
 
@@ -210,11 +218,11 @@ def motion(
     if view is not None:
         R, covariance, scale = rotation_only(ray_first[kept], ray_second[kept], setup.intrinsics, config.threshold)
     if still:
-        return turning_step(setup, state, R, covariance, len(first), StepFlag.STILL), state.length
+        return turning_step(setup, state, R, covariance, scale, len(first), StepFlag.STILL), state.length
     noise = scale if view is None else view.scale
     share = parallax_share(R, ray_first[kept], ray_second[kept], setup.intrinsics, noise)
     if share < config.parallax_share:
-        return turning_step(setup, state, R, covariance, len(first), StepFlag.ROTATION), state.length
+        return turning_step(setup, state, R, covariance, scale, len(first), StepFlag.ROTATION), state.length
     if view is None:
         return repeated_step(setup, state, len(first)), state.length
     return scaled_step(setup, state, view, ray_first, ray_second)

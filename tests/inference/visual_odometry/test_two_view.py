@@ -174,6 +174,24 @@ def test_a_turn_on_the_spot_is_flagged_and_measured() -> None:
     assert 3 - 5 * np.sqrt(6 / 50) < np.mean(squares) < 1.5 * (3 + 5 * np.sqrt(6 / 50))
 
 
+def test_far_points_hide_translation_and_the_covariance_says_so() -> None:
+    squares = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        pixels = rng.uniform([0, 0], [WIDTH, HEIGHT], (300, 2))
+        X = rays(pixels, INTRINSICS) * rng.uniform(60, 90, 300)[:, None]
+        T = np.eye(4)
+        T[0, 3] = 0.1
+        Y = transform(inverse(T), X)
+        second = Y[:, :2] / Y[:, 2:] * INTRINSICS[:2] + INTRINSICS[2:] + rng.normal(0, 0.3, (300, 2))
+        step = measured(pixels + rng.normal(0, 0.3, (300, 2)), second, KnownLengths(np.array([0.1])))
+        assert step.flags & (StepFlag.ROTATION | StepFlag.STILL)
+        error = se3_log(inverse(step.T_earlier_later) @ T)[:3]
+        squares.append(error @ np.linalg.solve(step.covariance[:3, :3], error))
+    # All points go 0.27 px to the left, which looks like a turn by 1.3 mrad: far outside what the residuals alone tell.
+    assert np.mean(squares) < 3 + 5 * np.sqrt(6 / 40)
+
+
 def test_rotation_alone_is_exact_without_noise() -> None:
     rng = np.random.default_rng(7)
     T = se3_exp(np.array([0.02, -0.1, 0.03, 0, 0, 0]))
