@@ -14,7 +14,7 @@ from tests.factories import instance_config, tiny_config, tiny_model
 def test_outputs_are_split_without_gap_or_overlap() -> None:
     """Each raw output moves one parameter only, but for the label logits, which move the shape's mean as well."""
     config = tiny_config()
-    head = RegionHead(10, config).double()
+    head = RegionHead(10, config, (6, 8), (4, 8)).double()
     raw = torch.zeros(sum(head.sizes), requires_grad=True)
     prior_mean = torch.randn(4, config.latent_dim)
     q = head.parameters_of(raw, prior_mean)
@@ -38,7 +38,7 @@ def test_outputs_are_split_without_gap_or_overlap() -> None:
 def test_start_of_the_azimuth_modes_and_of_the_boxes() -> None:
     """Features that say nothing: modes a quarter turn apart, and predictors of different sizes."""
     config = tiny_config(azimuth_components=4, predictors=3)
-    head = RegionHead(10, config).double()
+    head = RegionHead(10, config, (6, 8), (4, 8)).double()
     torch.nn.init.zeros_(head.outputs[-1].weight)
     torch.nn.init.zeros_(head.outputs[-1].bias)
     q = head.parameters_of(head(torch.randn(10)), torch.zeros(4, config.latent_dim))
@@ -67,7 +67,7 @@ def test_shape_mean_is_the_expected_prior_mean_plus_a_residual() -> None:
 
 def test_scales_are_positive_and_bounded_for_any_output() -> None:
     config = tiny_config()
-    head = RegionHead(10, config).double()
+    head = RegionHead(10, config, (6, 8), (4, 8)).double()
     for size in (1e6, -1e6):
         q = head.parameters_of(torch.full((sum(head.sizes),), size), torch.zeros(4, config.latent_dim))
         for name, low, high in (
@@ -82,7 +82,7 @@ def test_scales_are_positive_and_bounded_for_any_output() -> None:
 
 
 def test_map_touches_every_parameter() -> None:
-    head = RegionHead(10, tiny_config()).double()
+    head = RegionHead(10, tiny_config(), (6, 8), (4, 8)).double()
     q = head.parameters_of(torch.randn(3, sum(head.sizes)), torch.zeros(4, 4))
     first = q.map(lambda value: value[:1])
     for field in dataclasses.fields(RegionParameters):
