@@ -24,7 +24,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     def preset(name: str, world: Any, seed: int) -> drives.DriveConfig:
         asked.append((name, world, seed))
         config = original(name, world, seed)
-        return dataclasses.replace(config, frames=12, laps=0.15, size=(192, 96), objects=12, clutter=6)
+        return dataclasses.replace(config, frames=12, laps=0.12, size=(192, 96), objects=12, clutter=6)
 
     monkeypatch.setattr(drives, "drive_preset", preset)
     return asked
