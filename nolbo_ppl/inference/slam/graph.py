@@ -149,16 +149,22 @@ def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.Nonlinear
 
 
 def add_observation_factors(
-    graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3
+    graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3, robust_width: float | None = None
 ) -> None:
-    """One factor a detection, its covariance divided by its weight; weights below `minimum` are left out."""
+    """One factor a detection, its covariance divided by its weight; weights below `minimum` are left out.
+
+    Under a Cauchy kernel when a width is given.
+    """
     covariance = factors.covariance / np.maximum(factors.weight, 1e-12)[:, None, None]
     # One batched factorisation here, so that GTSAM checks nothing and prints nothing.
     information = np.linalg.inv(np.linalg.cholesky(covariance))
+    kernel = None if robust_width is None else gtsam.noiseModel.mEstimator.Cauchy.Create(robust_width)
     for k in np.flatnonzero(factors.weight > minimum):
-        graph.add(gtsam.BetweenFactorPose3(
-            pose_key(factors.frame[k]), landmark_key(factors.landmark[k]), gtsam.Pose3(factors.T_camera_landmark[k]),
-            gtsam.noiseModel.Gaussian.SqrtInformation(information[k], False)))
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.SqrtInformation(information[k], False)
+        if kernel is not None:
+            model = gtsam.noiseModel.Robust.Create(kernel, model)
+        graph.add(gtsam.BetweenFactorPose3(pose_key(factors.frame[k]), landmark_key(factors.landmark[k]),
+                                           gtsam.Pose3(factors.T_camera_landmark[k]), model))
 
 
 def add_landmark_priors(

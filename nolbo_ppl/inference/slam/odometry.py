@@ -23,6 +23,10 @@ from nolbo_ppl.inference.slam.state_types import SlamState
 
 WINDOW = 200
 """Frames the evidence is taken from: where most detections are."""
+ROBUST_WIDTH = 2.0
+"""Width of the Cauchy kernel on detections in the evidence: a few wrong ones in tracks would pass for drift."""
+LEAST_GAIN = 3.0
+"""Log evidence, in nats, that another scale must gain."""
 STEPS = (4.0, 2.0)
 """Factors tried on each scale, coarse first."""
 LEAST_FACTOR = 0.5
@@ -69,13 +73,16 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
 
 
 def log_evidence(window: SlamState, rotation: float, translation: float) -> float:
-    """Laplace log evidence of the window with odometry scales times the given factors, up to a constant, nats."""
+    """Laplace log evidence of the window with odometry scales times the given factors, up to a constant, nats.
+
+    Detections have heavy tails here.
+    """
     noise = replace(window.noise, rotation_step=window.noise.rotation_step * rotation,
                     translation_step=window.noise.translation_step * translation)
     graph = odometry_factors(window.problem, noise)
     factors = resolve_observations(window.problem, noise, window.config, window.estimate, window.rows, window.landmark,
                                    window.weight)
-    add_observation_factors(graph, factors)
+    add_observation_factors(graph, factors, robust_width=ROBUST_WIDTH)
     add_landmark_priors(graph, window.estimate.T_world_landmark, window.typical_range)
     estimate, _, error = optimise(graph, window.estimate, iterations=10)
     determinant = linearise(graph, estimate).log_determinant()
@@ -103,7 +110,7 @@ def odometry_by_evidence(state: SlamState) -> SlamState:
                     if not free[axis] or not LEAST_FACTOR <= trial[axis] <= LARGEST_FACTOR:
                         continue
                     value = log_evidence(window, *trial)
-                    if value > best + 0.5:
+                    if value > best + LEAST_GAIN:
                         factors, best, improved = trial, value, True
                         break
     report = dict(state.noise.report)
