@@ -27,6 +27,7 @@ from nolbo_ppl import __version__, evaluate
 from nolbo_ppl.data.dataset import write_scenes
 from nolbo_ppl.data.loader import prefetch
 from nolbo_ppl.data.scene_config import preset as scene_preset
+from nolbo_ppl.data.scene_config import rendered_size
 from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.training import TrainingData
 from nolbo_ppl.errors import input_error
@@ -70,7 +71,7 @@ OWN_SHAPES = {"shape_inclusive": 0.0, "shape_kl": 1.0, "voxels": 0.003}
 terms are thousands of nats an object and drown every other head at full weight."""
 
 VARIANTS = {
-    "default": Variant("default", "inclusive objective, every stage, mixture of azimuths, 16 dimensions, 128 px, second look"),
+    "default": Variant("default", "inclusive objective, every stage, mixture of azimuths, 16 dimensions, second look"),
     "elbo": Variant("objective", "the pure bound", {"objective": "elbo"}),
     "elbo-light-voxels": Variant("objective", "the bound, voxels at 0.003", {"objective": "elbo", "weights": {"voxels": 0.003}}),
     "paper": Variant("objective", "the bound, objectness turned, voxels at 0.003",
@@ -82,7 +83,7 @@ VARIANTS = {
     "equal-weights": Variant("auxiliary terms", "every inclusive term at weight 1",
                              {"weights": dict.fromkeys(INCLUSIVE, 1.0)}),
     "size-96": Variant("image size", "96 px", networks={"image_size": 96}),
-    "size-160": Variant("image size", "160 px", networks={"image_size": 160}),
+    "size-192": Variant("image size", "192 px", networks={"image_size": 192}),
     "angle": Variant("orientation", "one wrapped normal an angle", {"orientation": "angle"}),
     "sincos": Variant("orientation", "factorised Gaussian on (sin, cos)", {"orientation": "sincos"}),
     "latent-128": Variant("latent", "128 dimensions", {"latent_dim": 128}),
@@ -107,6 +108,9 @@ class Settings:
     """Steps of the shapes, single objects and scenes, with `--seconds 0`."""
     preset: Literal["nano", "tiny"] = "tiny"
     """Networks of every variant."""
+    image_size: int = 128
+    """Side in px of the images the networks look at, where a variant does not change it: smaller than the preset's, so that
+    a small budget pays for enough steps."""
     difficulty: Literal["easy", "standard", "full"] = "standard"
     """Scenes of training and evaluation."""
     count: int = 16384
@@ -151,7 +155,7 @@ def training_config(name: str, settings: Settings) -> AblationConfig:
         out=settings.out / name / "run", preset=settings.preset, difficulty=settings.difficulty, count=settings.count,
         single_count=settings.single_count, cache=settings.cache, seed=settings.seed, shape_steps=shapes,
         single_steps=single, scene_steps=scenes, batch=settings.batch, threads=settings.threads, workers=settings.workers,
-        networks=variant.networks, scenes=named_instances(settings) if variant.folder else None,
+        networks={"image_size": settings.image_size, **variant.networks}, scenes=named_instances(settings) if variant.folder else None,
     )  # fmt: skip
     return replace(config, **variant.training)
 
@@ -219,7 +223,7 @@ def measured(name: str, settings: Settings) -> dict[str, Any]:
     config, plan = planned(name, settings)
     start = time.process_time()
     summary = run(config)
-    size = config.model().image_size
+    size = rendered_size(config.model().image_size)
     evaluation = EvaluateConfig(
         out=settings.out / name / "figures", model=str(summary.out), count=settings.evaluated,
         difficulty=settings.difficulty, retrieval=settings.gallery > 0, gallery=max(settings.gallery, 2),

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from nolbo_ppl import __version__
 from nolbo_ppl.data.folder import SceneFolder
 from nolbo_ppl.data.instance_views import InstanceViews
-from nolbo_ppl.data.scene_config import preset
+from nolbo_ppl.data.scene_config import preset, rendered_size
 from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.truth import FolderScenes, GeneratedScenes, Scenes
 from nolbo_ppl.errors import input_error
@@ -100,7 +100,7 @@ def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSourc
 
         cad = tuple(load_cad_folder(config.cad, model_config.categories))
     return SceneSource(
-        preset(config.difficulty, model_config.image_size), seed=config.seed, cad=cad,
+        preset(config.difficulty, rendered_size(model_config.image_size)), seed=config.seed, cad=cad,
         backgrounds=None if config.backgrounds is None else str(config.backgrounds),
     )  # fmt: skip
 

@@ -36,7 +36,8 @@ def test_every_variant_is_a_run_of_its_own(ablations, settings):
         identity = config.identity()
         assert all(identity != other for other in seen.values()), name
         seen[name] = identity
-    assert seen["no-glimpse"]["networks"] == {"glimpse": 0} and seen["default"]["networks"] == {}
+    assert seen["default"]["networks"] == {"image_size": 128}
+    assert seen["no-glimpse"]["networks"] == {"image_size": 128, "glimpse": 0}
     assert ablations.training_config("no-glimpse", settings).model().glimpse == 0
     assert ablations.training_config("size-96", settings).model().image_size == 96
     assert ablations.training_config("sincos", settings).model().azimuth_components == 1

@@ -1,4 +1,7 @@
-"""Augmentation of images with their labels: colour, blur, noise, scale and translation; never a flip (azimuth).
+"""Augmentation of images with their labels: colour, blur, noise, scale and translation.
+
+An image is never flipped alone, which would make azimuths wrong; whole scenes are mirrored, objects and all, before
+(`nolbo_ppl.data.mirror`).
 
 Scale and translation are a crop or a zoom: boxes and intrinsics follow, so that positions and viewpoints stay exact.
 Every scene has a seed of its own: what is drawn does not depend on how a batch is spread over processes.
@@ -21,27 +24,29 @@ from nolbo_ppl.models.scene import SceneBatch
 class Augmentation:
     """Ranges and probabilities; ranges are (least, greatest)."""
 
-    scale: tuple[float, float] = (0.9, 1.15)
+    mirror_probability: float = 0.5
+    """Share of scenes that are mirrored, labels and shapes with the image (done by `SceneSupply`, which knows the shapes)."""
+    scale: tuple[float, float] = (0.85, 1.35)
     """Zoom factor, log-uniform."""
     translation: float = 0.08
     """Greatest shift along each side, as a share of the image."""
-    geometric_probability: float = 0.5
+    geometric_probability: float = 0.7
     """Share of images that are scaled and shifted."""
-    brightness: float = 15.0
+    brightness: float = 25.0
     """Greatest change of brightness, of 255."""
-    contrast: tuple[float, float] = (0.85, 1.2)
+    contrast: tuple[float, float] = (0.75, 1.35)
     """Factor of the contrast about mid-grey, log-uniform."""
-    saturation: tuple[float, float] = (0.7, 1.3)
+    saturation: tuple[float, float] = (0.4, 1.4)
     """Factor of the saturation."""
-    hue: float = 0.1
+    hue: float = 0.25
     """Greatest turn of the hue, rad."""
     inversion_probability: float = 0.01
     """Share of images with inverted colours."""
-    blur_probability: float = 0.1
+    blur_probability: float = 0.15
     """Share of blurred images."""
-    noise_probability: float = 0.1
+    noise_probability: float = 0.15
     """Share of images with added noise."""
-    noise: float = 6.0
+    noise: float = 8.0
     """Greatest scale of the added noise, of 255."""
     least_visible: float = 0.1
     """Objects of which less stays visible in the image lose their label."""

@@ -129,6 +129,9 @@ def _object(
         R_world_object = R_world_object @ R_pitch @ R_bank
     extents = shape.dimensions / shape.diagonal
     texture_seed = int(rng.integers(2**31))
+    own = np.random.default_rng(texture_seed)  # of its own, so that the share changes nothing else in the scene
+    if own.random() < config.single_material:
+        materials = (sample_material("body", own),) * len(materials)
     place = composer.place(extents, R_world_object, _pixel_range(config.object_pixels, config.size), flying)
     if place is None:
         return None

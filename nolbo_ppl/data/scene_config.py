@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
 
+RENDERED = 128
+"""Greatest side, px, of scenes generated to learn from and to measure on; networks that look at larger images see them
+enlarged."""
 DIFFICULTIES: tuple[str, ...] = ("easy", "standard", "full")
 
 
@@ -48,6 +51,8 @@ class SceneConfig:
     """Share of objects placed beside one that is there already, so that they occlude each other."""
     truncation_probability: float = 0.06
     """Share of objects whose centre may lie anywhere in the image, so that its border cuts them."""
+    single_material: float = 0.0
+    """Share of objects whose parts all have one paint, as CAD meshes without materials do."""
     least_visibility: float = 0.15
     """Objects of which less is seen are taken out of the scene (not only out of the labels)."""
     least_box: float = 5.0
@@ -107,6 +112,11 @@ def full(size: int = 128) -> SceneConfig:
         least_visibility=0.1, least_box=4.0, backgrounds=(0.15, 0.3, 0.2, 0.35), photographs=0.7, muted=0.4,
         sun_elevation=(10.0, 88.0), second_light_probability=0.4, tint=0.3, exposure=(0.5, 1.6), blur=0.9, noise=0.035,
     )  # fmt: skip
+
+
+def rendered_size(image_size: int) -> int:
+    """Side, px, of the scenes generated for a network that looks at images of `image_size`."""
+    return min(image_size, RENDERED)
 
 
 def preset(difficulty: str, size: int = 128) -> SceneConfig:

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from nolbo_ppl.data.arrays import Arrays
 from nolbo_ppl.data.augment import Augmentation, augment
 from nolbo_ppl.data.cache import CachedScenes
 from nolbo_ppl.data.loader import Scenes, batch_indices
+from nolbo_ppl.data.mirror import mirror, mirror_voxels
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.stages import seeded_noise
 from nolbo_ppl.models.nolbo import Nolbo
@@ -105,19 +106,37 @@ class ShapeTable:
         return ShapeBatch(self.packed[index], self.category[index], instance, noise)
 
     @torch.no_grad()
-    def teach(self, model: Nolbo) -> None:
-        """Let the trained shape guide encode every shape: the truth of the shape latent in later stages."""
+    def teach(self, model: Nolbo, mirrored: bool = False) -> None:
+        """Let the trained shape guide encode every shape: the truth of the shape latent in later stages.
+
+        Args:
+            model: the networks.
+            mirrored: encode every shape's mirror image too.
+        """
         model.shape_guide.eval()
-        parts = [model.shape_guide.posterior(part) for part in self.packed.split(256)]
+        sides = [self.packed, mirror_voxels(self.packed)] if mirrored and len(self) else [self.packed]
+        parts = [model.shape_guide.posterior(part) for side in sides for part in side.split(256)]
         self.loc = torch.cat([loc for loc, _ in parts])
         self.scale = torch.cat([scale for _, scale in parts])
 
-    def add_teacher(self, batch: SceneBatch) -> SceneBatch:
-        """The batch with the teacher's posterior of each object; a shape that is not in the table is unknown."""
+    def add_teacher(self, batch: SceneBatch, mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
+        """The batch with the teacher's posterior of each object; a shape that is not in the table is unknown.
+
+        Args:
+            batch: scenes with the numbers of their shapes.
+            mirrored: scenes that will be mirrored; the table must have been taught both sides.
+
+        Raises:
+            InputError: mirrored scenes, of a table that knows no mirrored shape.
+        """
         if self.loc is None or self.scale is None or len(self) == 0:
             return batch.replace(has_voxels=torch.zeros_like(batch.has_voxels)) if len(self) == 0 else batch
         row = torch.from_numpy(np.searchsorted(self.number, batch.instance.numpy()).clip(0, len(self) - 1))
         known = torch.from_numpy(self.number)[row] == batch.instance
+        if mirrored is not None:
+            if len(self.loc) != 2 * len(self):
+                raise input_error("latents of mirrored shapes", got="a table taught one side", do="teach(model, mirrored=True)")
+            row = row + mirrored[:, None] * len(self)
         return batch.replace(
             shape_loc=self.loc[row], shape_scale=self.scale[row], has_voxels=batch.has_voxels & known
         )
@@ -133,7 +152,8 @@ class SceneSupply:
         seed: seed of order, augmentation and noise.
         latent_dim: dimensions of the shape latent, for its noise.
         augmentation: what is done to the images, None for nothing.
-        sizes: image sides to choose from, a step; None for the data set's own.
+        size: longer side images are brought to, px, a multiple of 32; None for the data set's own.
+        sizes: sides to choose from in its place, a step.
         known_instances: numbers below this are instance labels of the model.
         rank: number of this process.
         world: number of processes; each takes an equal part of the joint batch.
@@ -147,6 +167,7 @@ class SceneSupply:
         seed: int,
         latent_dim: int,
         augmentation: Augmentation | None = None,
+        size: int | None = None,
         sizes: Sequence[int] | None = None,
         known_instances: int = 0,
         rank: int = 0,
@@ -156,15 +177,19 @@ class SceneSupply:
             raise input_error("batch size", got=batch_size, expected=f"a multiple of the {world} processes")
         self.scenes, self.table, self.batch_size, self.seed = scenes, table, batch_size, seed
         self.latent_dim, self.augmentation, self.known = latent_dim, augmentation, known_instances
-        self.sizes = tuple(sizes) if sizes else ()
+        self.size, self.sizes = size, tuple(sizes) if sizes else ()
         self.part = slice(rank * batch_size // world, (rank + 1) * batch_size // world)
 
     def batch(self, step: int) -> SceneBatch:
         """The batch of a step (this process's part of it)."""
         index = batch_indices(len(self.scenes), self.batch_size, self.seed, step)[self.part]
-        batch = self.prepared(index)
         generator = np.random.default_rng([self.seed, step, 1])
-        size = int(generator.choice(self.sizes)) if self.sizes else None
+        mirrored = None
+        if self.augmentation is not None and self.augmentation.mirror_probability > 0:
+            drawn = np.random.default_rng([self.seed, step, 2]).random(self.batch_size)[self.part]
+            mirrored = torch.from_numpy(drawn < self.augmentation.mirror_probability)
+        batch = self._labelled(index, mirrored)
+        size = int(generator.choice(self.sizes)) if self.sizes else self._other(batch)
         if self.augmentation is not None or size is not None:
             seeds = generator.integers(2**63, size=self.batch_size)[self.part]
             batch = augment(batch, self.augmentation, seeds, size)
@@ -172,6 +197,18 @@ class SceneSupply:
         return batch.replace(noise=noise[self.part])
 
     def prepared(self, index: Int[np.ndarray, " b"]) -> SceneBatch:
-        """Scenes of these numbers as they are, with the teacher's latents."""
-        batch = self.table.add_teacher(to_batch(self.scenes.batch(index)))
+        """Scenes of these numbers without augmentation, with the teacher's latents."""
+        batch = self._labelled(index)
+        size = self._other(batch)
+        return batch if size is None else augment(batch, None, np.zeros(len(index), dtype=np.int64), size)
+
+    def _other(self, batch: SceneBatch) -> int | None:
+        """The side images are brought to, or None where they have it."""
+        return None if self.size is None or self.size == max(batch.image.shape[-2:]) else self.size
+
+    def _labelled(self, index: Int[np.ndarray, " b"], mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
+        """Scenes of these numbers as they are, or mirrored, with the teacher's latents."""
+        batch = self.table.add_teacher(to_batch(self.scenes.batch(index)), mirrored)
+        if mirrored is not None:
+            batch = mirror(batch, mirrored)
         return batch.replace(instance=torch.where(batch.instance < self.known, batch.instance, -1))

@@ -15,7 +15,7 @@ from nolbo_ppl.data.cache import CachedScenes, write_cache
 from nolbo_ppl.data.drive.views import ViewConfig, ViewSource
 from nolbo_ppl.data.folder import SceneFolder
 from nolbo_ppl.data.loader import Scenes, prefetch
-from nolbo_ppl.data.scene_config import SceneConfig
+from nolbo_ppl.data.scene_config import SceneConfig, rendered_size
 from nolbo_ppl.data.scene_config import preset as scene_preset
 from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.data.supply import Joined, Part, SceneSupply, ShapeTable
@@ -38,6 +38,9 @@ class TrainingData:
     def __init__(self, config: TrainConfig, rank: int, world: int) -> None:
         self.config, self.rank, self.world = config, rank, world
         self.model = config.model()
+        self.augmentation: Augmentation | None = None
+        if config.augment:
+            self.augmentation = Augmentation(mirror_probability=0.5 if config.mirror and not config.instance_labels else 0.0)
         size = self.model.image_size
         self.train: Scenes
         self.single: Scenes
@@ -45,9 +48,12 @@ class TrainingData:
         if config.scenes is not None:
             self._open_folders(config.scenes, size)
         else:
+            size = rendered_size(size)
             mixed = config.difficulty == "mixed"
             kinds = ("standard", "full") if mixed else (config.difficulty,)
             bases = [scene_preset(kind, size) for kind in kinds]
+            if mixed:  # CAD without materials, and photographs, look like no other generated scene
+                bases[1] = dataclasses.replace(bases[1], single_material=0.25, photographs=0.85)
             photographs = None if config.backgrounds is None else str(config.backgrounds)
             root = config.cache.expanduser() / "scenes"
             if world > 1 and rank > 0:
@@ -118,7 +124,7 @@ class TrainingData:
         supply = SceneSupply(
             self.single if stage == "single" else self.train, self.table, config.batch,
             3 * config.seed + (1 if stage == "single" else 2), latent,
-            Augmentation() if config.augment else None, config.sizes, len(self.model.instances), self.rank, self.world,
+            self.augmentation, self.model.image_size, config.sizes, len(self.model.instances), self.rank, self.world,
         )  # fmt: skip
 
         def scenes() -> Iterator[SceneBatch]:
@@ -132,7 +138,8 @@ class TrainingData:
     def validation(self, count: int | None) -> Iterator[SceneBatch]:
         """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
         known = len(self.model.instances)
-        supply = SceneSupply(self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, known_instances=known)
+        supply = SceneSupply(self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, size=self.model.image_size,
+                             known_instances=known)
         total = len(self._held_out) if count is None else min(count, len(self._held_out))
         for first in range(0, total, 64):
             batch = supply.prepared(np.arange(first, min(first + 64, total)))
@@ -141,5 +148,6 @@ class TrainingData:
     def teach(self, model: Nolbo) -> None:
         """Encode the shapes by the trained shape guide, in full precision."""
         model.set_half_precision(False)
-        self.table.teach(model)
-        self._held_out_table.teach(model)
+        self.table.teach(model, mirrored=self.augmentation is not None and self.augmentation.mirror_probability > 0)
+        if self._held_out_table is not self.table:
+            self._held_out_table.teach(model)

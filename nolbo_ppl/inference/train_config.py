@@ -39,6 +39,8 @@ class TrainConfig:
     """Give every instance of `scenes` a label: the latent is split in halves for category and instance."""
     latent_dim: int | None = None
     """Dimensions of the shape latent; the preset's by default."""
+    image_size: int | None = None
+    """Side in px of the images the network looks at, a multiple of 32; the preset's, or the initial weights', by default."""
     scenes: Path | None = None
     """Folder of a data set written by `nolbo scenes`, or of your own; without it scenes are generated."""
     validation: Path | None = None
@@ -80,7 +82,10 @@ class TrainConfig:
     sizes: tuple[int, ...] = ()
     """Image sides to choose from each step, multiples of 32; empty for the preset's own."""
     augment: bool = True
-    """Blur, colour, scale and translation at random; never a flip."""
+    """Blur, colour, scale and translation at random; half the scenes mirrored."""
+    mirror: bool = True
+    """Mirror scenes with their labels and shapes, where images are augmented; never with instance labels, for a mirrored
+    instance is another one. Leave it out where left and right set categories apart."""
     bf16: bool = True
     """Networks in bfloat16."""
     threads: int = 0
@@ -122,8 +127,10 @@ class TrainConfig:
                     "initial weights of another form", got=f"orientation {config.orientation}, {config.latent_dim} dimensions",
                     do="leave --orientation and --latent-dim out",
                 )
-            return config
+            return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)
         changes: dict[str, Any] = {}
+        if self.image_size is not None:
+            changes["image_size"] = self.image_size
         if self.orientation is not None:
             changes["orientation"] = self.orientation
             changes["azimuth_components"] = 4 if self.orientation == "mixture" else 1

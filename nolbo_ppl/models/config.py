@@ -38,7 +38,7 @@ class ModelConfig:
     predictors: int = 2
     """Predictors P of each cell; a scene of G x G cells has K = G G P regions."""
     image_size: int = 128
-    """Side in pixels of the images it is trained on, a multiple of 32. Other multiples of 32 work as well."""
+    """Side in pixels that images are brought to, a multiple of 32. Other multiples of 32 work as well."""
     latent_dim: int = 16
     """Dimensions of the shape latent; with instance labels half of them describe the category, half the instance."""
     prior_width: int = 64
@@ -151,8 +151,8 @@ class ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """The default for CPUs: 3.0 M parameters (1.8 M of them the image guide), 128 px, 32^3 voxels."""
-    return ModelConfig()
+    """The default for CPUs: 3.0 M parameters (1.8 M of them the image guide), 192 px, 32^3 voxels."""
+    return ModelConfig(image_size=192)
 
 
 def nano() -> ModelConfig:

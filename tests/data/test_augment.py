@@ -73,7 +73,8 @@ def test_positions_stay_exact(size: int | None) -> None:
     assert ((box[moved.present] >= 0) & (box[moved.present] <= side)).all()
     zoom = moved.intrinsics[:, 0] / batch.intrinsics[:, 0] / (side / 64)
     torch.testing.assert_close(moved.intrinsics[:, 1] / batch.intrinsics[:, 1] / (side / 64), zoom)
-    assert zoom.min() >= 0.8 - 1e-9 and zoom.max() <= 1.3 + 1e-9 and zoom.std() > 0.05
+    low, high = MOVING.scale
+    assert zoom.min() >= low - 1e-9 and zoom.max() <= high + 1e-9 and zoom.std() > 0.05
 
 
 @pytest.mark.parametrize("size", [None, 96])

@@ -27,6 +27,8 @@ WORLDS_A_SEED = 10_000
 """Worlds of successive seeds of a source are this far apart."""
 NUMBERS = 1_000_000
 """Instances of a world are numbered from this times its number, plus one, apart from those of scenes and of each other."""
+VERSION = 2
+"""Raised when the same seed gives other views than before."""
 TRIES = 6
 """Places tried for an image that holds no object, or more than there are slots."""
 
@@ -124,7 +126,7 @@ class ViewSource:
 
     def describe(self) -> dict[str, object]:
         """All that the scenes depend on, as plain JSON values."""
-        return {"views": asdict(self.config), "seed": self.seed, "layout": LAYOUT}
+        return {"views": asdict(self.config), "seed": self.seed, "views_version": VERSION, "layout": LAYOUT}
 
 
 def _renumbered(label: ObjectLabel, first: int) -> ObjectLabel:
