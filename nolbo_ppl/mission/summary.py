@@ -31,7 +31,7 @@ from nolbo_ppl.mission.figures import (
 )
 from nolbo_ppl.mission.noise import read_noise
 from nolbo_ppl.mission.scene import stands
-from nolbo_ppl.mission.truth import DriveTruth, Matched, match_detections, read_truth
+from nolbo_ppl.mission.truth import DriveTruth, Matched, match_detections, object_shown, read_truth
 
 ASSOCIATION_IOU = 0.3
 """Overlap from which a detection is held to be of an object where its association is judged: loose boxes are no wrong loops."""
@@ -210,7 +210,7 @@ def summarise(
     objects = None
     if drive is not None:
         truth, table = read_truth(drive, result.images), result.table
-        loosely = match_detections(table.frame, result.box, table.objectness, truth, ASSOCIATION_IOU).object
+        loosely = object_shown(table.frame, result.box, truth, ASSOCIATION_IOU)
         objects = {"objects": {name: truth.names[i] if i >= 0 else None for name, i in zip(table.id, loosely.tolist())}}
         out |= truth_figures(result, problem, truth, loosely, model, config, loop_gap, np.random.default_rng([seed, 3]))
     out |= time_figures(seconds, cpu_seconds, len(result.estimate))

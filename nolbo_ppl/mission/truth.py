@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.metrics.detection import match_image
 
 if TYPE_CHECKING:
@@ -147,6 +149,23 @@ class Matched:
     def recall(self) -> float:
         """Share of the objects to be found that were."""
         return self.found / self.wanted if self.wanted else float("nan")
+
+
+def object_shown(
+    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], truth: DriveTruth, least_overlap: float
+) -> Int[np.ndarray, " k"]:
+    """Number of the object each detection overlaps most, -1 where none reaches `least_overlap` (IoU).
+
+    Unlike `match_detections`, two detections may be of one object: whose a detection is does not depend on the others.
+    """
+    shown = np.full(len(frame), -1)
+    for t, seen in enumerate(truth.frames):
+        rows = np.flatnonzero(frame == t)
+        if len(rows) and len(seen.object):
+            overlap = box_iou(torch.from_numpy(box[rows])[:, None], torch.from_numpy(seen.box)[None]).numpy()
+            best = overlap.argmax(1)
+            shown[rows] = np.where(overlap.max(1) >= least_overlap, seen.object[best], -1)
+    return shown
 
 
 def match_detections(

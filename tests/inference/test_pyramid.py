@@ -36,7 +36,7 @@ class Eyes:
     decode = shape_posterior = prior_mean = None
 
     def __init__(self, objectness):
-        self.config, self.objectness, self.asked = tiny(), objectness, []
+        self.config, self.objectness, self.asked = dataclasses.replace(tiny(), image_size=128), objectness, []
 
     def observe(self, images, intrinsics, *, threshold, iou_threshold, decode, batch, size):
         return [answers(BOX, self.objectness[size], size) for _ in images]
@@ -87,7 +87,7 @@ def test_a_pyramid_of_one_size_answers_as_the_model_does():
     from nolbo_ppl.inference.queries import ObservationModel
     from nolbo_ppl.models.nolbo import Nolbo
 
-    model = ObservationModel(Nolbo.from_seed(tiny(), 0))
+    model = ObservationModel(Nolbo.from_seed(dataclasses.replace(tiny(), image_size=128), 0))
     image = np.random.default_rng(0).integers(0, 256, (128, 128, 3), dtype=np.uint8)
     box = np.array([[10, 20, 60, 70], [50, 50, 90, 120.0]])
     plain, level = model.observe_boxes([image], None, [box], decode=False)[0], None

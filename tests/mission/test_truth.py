@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.mission.truth import DriveTruth, TrueFrame, match_detections, read_truth
+from nolbo_ppl.mission.truth import DriveTruth, TrueFrame, match_detections, object_shown, read_truth
 from tests.mission.conftest import SimulatedDrive
 
 
@@ -61,6 +61,14 @@ def test_hardly_seen_objects_count_neither_way() -> None:
     np.testing.assert_array_equal(found.counted, [True, False, False, False, False])
     assert (found.found, found.wanted) == (1, 1)
     assert found.precision == pytest.approx(1 / 3) and found.recall == 1.0
+
+
+def test_two_detections_may_show_one_object() -> None:
+    truth = one_frame([[0, 0, 20, 20], [10, 0, 30, 20]], [1.0, 1.0])
+    box = np.array([[0.0, 0, 20, 20], [1, 0, 21, 20], [9, 0, 29, 20], [100, 0, 120, 20], [0, 0, 6, 6]])
+    shown = object_shown(np.zeros(5, dtype=int), box, truth, 0.3)
+    np.testing.assert_array_equal(shown, [0, 0, 1, -1, -1])
+    assert object_shown(np.zeros(0, dtype=int), np.zeros((0, 4)), truth, 0.3).shape == (0,)
 
 
 @pytest.mark.parametrize(
