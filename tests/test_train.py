@@ -18,6 +18,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.cli import main
 from nolbo_ppl.data import cache, training
 from nolbo_ppl.data.dataset import write_scenes
 from nolbo_ppl.data.scene_config import preset
@@ -28,6 +30,7 @@ from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.stages import StageRun
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import read_json, read_jsonl, write_jsonl
+from nolbo_ppl.models.config import ModelConfig, nano
 from nolbo_ppl.train import TrainConfig, run
 
 
@@ -68,6 +71,9 @@ def arguments_of(config: TrainConfig) -> list[str]:
             continue
         if isinstance(value, dict):
             result += [f"--{name}", *(str(part) for item in value.items() for part in item)]
+            continue
+        if isinstance(value, tuple):
+            result += [f"--{name}", *map(str, value)]
             continue
         result += [f"--{name}" if value else f"--no-{name}"] if isinstance(value, bool) else [f"--{name}", str(value)]
     return result
@@ -332,6 +338,62 @@ def test_instance_labels_split_the_latent(folders: tuple[Path, Path], tmp_path: 
     assert posterior.shape[1] == len(named) + 1
 
 
+def renamed(folder: Path, out: Path, names: tuple[str, ...]) -> Path:
+    """A folder whose objects have other categories, by the number of their own."""
+    (out / "images").mkdir(parents=True)
+    records = []
+    for _, row in read_jsonl(folder / "scenes.jsonl"):
+        (out / row["image"]).write_bytes((folder / row["image"]).read_bytes())
+        for thing in row["objects"]:
+            thing["category"] = names[CATEGORIES.index(thing["category"]) % len(names)]
+            del thing["symmetry"]
+        records.append(row)
+    write_jsonl(out / "scenes.jsonl", records)
+    (out / "voxels.npz").write_bytes((folder / "voxels.npz").read_bytes())
+    return out
+
+
+def test_own_categories_train_by_the_command_line(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair = tuple(renamed(folder, tmp_path / name, ("box", "mug")) for folder, name in zip(folders, ("train", "held_out")))
+    config = config_of(pair, tmp_path / "run", categories=("box", "mug"), symmetry=(2, 1))
+    command = ["train", *arguments_of(config)]
+    assert "--categories box mug --symmetry 2 1" in " ".join(command)
+    main(command)
+    model = load(tmp_path / "run" / "model")
+    assert (model.config.categories, model.config.symmetry) == (("box", "mug"), (2, 1))
+    assert {"category", "bound"} <= set(json.loads(capsys.readouterr().out)["held_out"])
+    found = model.observe(np.full((64, 64, 3), 90, dtype=np.uint8), threshold=1e-6)
+    assert found.class_posterior.shape[1] == 2
+
+    start = str(tmp_path / "run" / "model")
+    assert config_of(pair, tmp_path / "more", initial=start, categories=("box", "mug")).model() == model.config
+    for other in ({"categories": ("mug", "box")}, {"categories": ("box", "mug"), "symmetry": (1, 1)}):
+        with pytest.raises(InputError, match="initial weights of other categories: got box mug of symmetry 2 1"):
+            config_of(pair, tmp_path / "other", initial=start, **other).model()
+    with pytest.raises(InputError, match=r"scenes\.jsonl:\d+: objects\[0\]\.category: got '(box|mug)', expected one of aeroplane"):
+        run(config_of(pair, tmp_path / "preset"))
+
+
+def test_symmetry_of_own_categories_is_that_of_their_names_or_none(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    def model(**changes: Any) -> ModelConfig:
+        return config_of(folders, tmp_path, **changes).model()
+
+    assert model(categories=("bottle", "mug", "car")).symmetry == (0, 1, 1)
+    assert model(categories=("bottle", "mug"), symmetry=(1, 4)).symmetry == (1, 4)
+    assert model() == nano()
+    with pytest.raises(InputError, match="category names must be unique"):
+        model(categories=("mug", "mug"))
+
+
+def test_a_checkpoint_older_than_own_categories_goes_on(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    identity = config_of(folders, tmp_path).identity()
+    assert "categories" not in identity and "symmetry" not in identity and "mirror" in identity
+    own = config_of(folders, tmp_path, categories=("box", "mug"), symmetry=(2, 1)).identity()
+    assert (own["categories"], own["symmetry"]) == (["box", "mug"], [2, 1])
+
+
 def test_image_sizes_vary_by_step(folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen, original = set(), StageRun.step
 
@@ -385,6 +447,10 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_term(
         ({"sizes": (100,)}, "sizes: got \\(100,\\), expected positive multiples of 32"),
         ({"scenes": None, "validation": None, "instance_labels": True}, "give --scenes"),
         ({"scenes": None}, "held-out scenes without training scenes"),
+        ({"symmetry": (2, 1)}, "symmetry: got 2 for 0 categories, expected one for each of --categories"),
+        ({"categories": ("box", "mug"), "symmetry": (2,)}, "symmetry: got 1 for 2 categories"),
+        ({"categories": ("box",), "symmetry": (-1,)}, r"symmetry: got \(-1,\), expected 1 \(none\)"),
+        ({"scenes": None, "validation": None, "categories": ("car", "bus")}, "own categories: got generated scenes.*give --scenes"),
     ],
 )
 def test_ill_formed_options(folders: tuple[Path, Path], tmp_path: Path, changes: dict[str, Any], match: str) -> None:

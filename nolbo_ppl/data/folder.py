@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
 from nolbo_ppl.data.arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels
 from nolbo_ppl.data.dataset import SCENES
 from nolbo_ppl.data.pool import VOXELS
@@ -63,6 +63,7 @@ class SceneFolder:
         instances: Sequence[str] | None = None,
         size: int = 128,
         slots: int | None = None,
+        symmetry: Sequence[int] | None = None,
     ) -> None:
         """Open a folder.
 
@@ -72,6 +73,8 @@ class SceneFolder:
             instances: known instance names; by default those that occur. Others count as unlabelled.
             size: height and width the images are brought to, a multiple of 32.
             slots: object slots an image; by default 8, or more when an image has more objects.
+            symmetry: order of each of `categories` for objects that state none; by default `CATEGORY_SYMMETRY`, 1 for names
+                unknown there.
 
         Raises:
             InputError: anything malformed, naming file, line and field.
@@ -84,6 +87,9 @@ class SceneFolder:
         if not self.path.is_dir():
             raise input_error("no such data set", got=path, expected=f"a folder with {SCENES}")
         self.categories, self.size = tuple(categories), size
+        if symmetry is not None and len(symmetry) != len(self.categories):
+            raise input_error("symmetry", got=f"{len(symmetry)} values", expected=f"one of each of {len(self.categories)} categories")
+        self._symmetries = CATEGORY_SYMMETRY if symmetry is None else dict(zip(self.categories, symmetry))
         self.records: list[SceneRecord] = []
         self.image_sizes: list[tuple[int, int]] = []
         self._read_lines()
@@ -106,7 +112,7 @@ class SceneFolder:
                     image_size = opened.size
             except OSError as error:
                 raise input_error("image", got=error, expected="a readable picture", file=file, line=line) from None
-            self.records.append(parse_record(row, file, line, self.categories, image_size, image))
+            self.records.append(parse_record(row, file, line, self.categories, image_size, image, self._symmetries))
             self.image_sizes.append(image_size)
         if not self.records:
             raise input_error("a data set without images", got=file, expected="at least one line")

@@ -9,7 +9,7 @@ A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objec
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,7 +124,7 @@ def _parse_rotation(at: _Line, row: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _parse_object(
-    at: _Line, row: object, number: int, width: int, height: int, categories: Sequence[str]
+    at: _Line, row: object, number: int, width: int, height: int, categories: Sequence[str], symmetries: Mapping[str, int]
 ) -> ObjectRecord:
     where = f"objects[{number}]."
     if not isinstance(row, dict):
@@ -155,14 +155,15 @@ def _parse_object(
     visibility = at.number(row, "visibility", where, "a share from 0 to 1") if "visibility" in known else 1.0
     if not 0 <= visibility <= 1:
         raise at.error(f"{where}visibility", visibility, "a share from 0 to 1")
-    symmetry = row["symmetry"] if "symmetry" in known else CATEGORY_SYMMETRY.get(category or "", 1)
+    symmetry = row["symmetry"] if "symmetry" in known else symmetries.get(category or "", 1)
     if isinstance(symmetry, bool) or not isinstance(symmetry, int) or symmetry < 0:
         raise at.error(f"{where}symmetry", symmetry, "0 (free about the vertical axis), 1 (none) or n (n-fold)")
     return ObjectRecord(box, category, instance, R, position, size, visibility, symmetry)
 
 
 def parse_record(
-    row: dict[str, Any], file: Path, line: int, categories: Sequence[str], image_size: tuple[int, int], image: Path
+    row: dict[str, Any], file: Path, line: int, categories: Sequence[str], image_size: tuple[int, int], image: Path,
+    symmetries: Mapping[str, int] = CATEGORY_SYMMETRY,
 ) -> SceneRecord:
     """Check one line and turn it into a record.
 
@@ -173,6 +174,7 @@ def parse_record(
         categories: known category names.
         image_size: width and height of the image, px.
         image: path of the image.
+        symmetries: symmetry of an object that states none, by category; 1 for names that are missing.
 
     Raises:
         InputError: names file, line and field, what was got and what was expected.
@@ -185,7 +187,7 @@ def parse_record(
     objects = row.get("objects")
     if not isinstance(objects, list):
         raise at.error("objects", objects, "a list of objects (empty when there is none)")
-    parsed = [_parse_object(at, thing, k, *image_size, categories) for k, thing in enumerate(objects)]
+    parsed = [_parse_object(at, thing, k, *image_size, categories, symmetries) for k, thing in enumerate(objects)]
     regions = [] if row.get("ignore") is None else row["ignore"]
     if not isinstance(regions, list):
         raise at.error("ignore", regions, "a list of boxes [x0, y0, x1, y1] in px")

@@ -237,6 +237,18 @@ def test_missing_labels_are_unlabelled(user: Callable[..., Path]) -> None:
     assert bottle["symmetry"][0, 0] == 0  # what the category declares
 
 
+def test_declared_symmetry_is_that_of_objects_that_state_none(user: Callable[..., Path]) -> None:
+    line = user_line(category="mug", symmetry=None)
+    stated = {**line["objects"][0], "category": "box", "symmetry": 4}
+    unknown = {"box": stated["box"]}
+    line["objects"] += [stated, unknown]
+    folder = user(line)
+    assert SceneFolder(folder, ("box", "mug")).batch([0])["symmetry"][0, :3].tolist() == [1, 4, 1]
+    assert SceneFolder(folder, ("box", "mug"), symmetry=(1, 2)).batch([0])["symmetry"][0, :3].tolist() == [2, 4, 1]
+    with pytest.raises(InputError, match="symmetry: got 1 values, expected one of each of 2 categories"):
+        SceneFolder(folder, ("box", "mug"), symmetry=(1,))
+
+
 def test_letterbox_keeps_the_perspective(user: Callable[..., Path]) -> None:
     """A point projected with the new intrinsics lands where the letterbox took its pixel; boxes follow."""
     folder = SceneFolder(user(user_line()), size=64)
