@@ -90,7 +90,7 @@ def test_the_parser_would_refuse_a_wrong_option(capsys: pytest.CaptureFixture[st
     assert "no-such-option" in capsys.readouterr().err
 
 
-LONG = ("run(Kitchen",)
+LONG = ("run(kitchen)",)
 """Blocks that take minutes: tests of their own run them on less."""
 SCENES = """
 from nolbo_ppl.data.dataset import write_scenes
@@ -154,19 +154,41 @@ def test_links_between_documents_lead_somewhere() -> None:
 
 @pytest.mark.slow
 def test_own_categories_train_as_the_how_to_says(tmp_path: Path) -> None:
-    """The derived configuration of docs/howto/own-categories.md, with the folder of docs/howto/own-data.md."""
+    """Command lines and configuration of docs/howto/own-categories.md, with the folder of docs/howto/own-data.md."""
     own_data, own_categories = ROOT / "docs/howto/own-data.md", ROOT / "docs/howto/own-categories.md"
     folder = next(text for text in blocks(own_data, "python") if "scenes.jsonl" in text)
     folder = folder.replace('"my_folder"', '"kitchen"').replace('"car"', '"mug"').replace("range(4)", "range(12)")
-    kitchen = next(text for text in blocks(own_categories, "python") if "class Kitchen" in text)
-    short = (
-        'preset="nano", shape_steps=2, single_steps=0, scene_steps=2, batch=4, workers=1, validation=Path("kitchen")'
-    )
-    kitchen = kitchen.replace('validation=Path("kitchen_held_out")', short)
-    (tmp_path / "train.py").write_text(folder + kitchen, encoding="utf-8")
-    subprocess.run([sys.executable, "train.py"], cwd=tmp_path, check=True, timeout=300, capture_output=True)
-    config = json.loads((tmp_path / "runs/kitchen/model/config.json").read_text())
-    assert config["model"]["categories"] == ["box", "mug"]
+
+    def run(*arguments: str) -> str:
+        command = [sys.executable, *arguments]
+        done = subprocess.run(command, cwd=tmp_path, timeout=300, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-3000:]
+        return done.stdout
+
+    (tmp_path / "folder.py").write_text(folder, encoding="utf-8")
+    run("folder.py")
+    (tmp_path / "kitchen_held_out").symlink_to("kitchen")
+    short = {"preset": "nano", "shape_steps": 2, "single_steps": 0, "scene_steps": 2, "batch": 4, "workers": 1}
+    options = {
+        "train": [text for name, value in short.items() for text in (f"--{name.replace('_', '-')}", str(value))],
+        "evaluate": ["--resamples", "20", "--no-pictures"],
+        "observe": [],
+    }
+    for line in (line for line in commands(own_categories) if line.split()[1] in options):
+        verb, *arguments = shlex.split(line)[1:]
+        run("-m", "nolbo_ppl.cli", verb, *arguments, *options.pop(verb))
+    assert not options, "a verb is missing on the page"
+    config = json.loads((tmp_path / "runs/kitchen/model/config.json").read_text())["model"]
+    assert (config["categories"], config["symmetry"]) == (["box", "mug"], [2, 1])
+    figures = json.loads((tmp_path / "figures/metrics.json").read_text())
+    assert figures["categories"] == ["box", "mug"] and figures["by_category"]["mug"]["objects"] == 12
+
+    python = next(text for text in blocks(own_categories, "python") if "run(kitchen)" in text)
+    python = python.replace("symmetry=(2, 1),", "symmetry=(2, 1), **" + repr(short) + ",")
+    (tmp_path / "train.py").write_text(python + "print(kitchen.identity())", encoding="utf-8")
+    before = (tmp_path / "runs/kitchen/checkpoint.safetensors").read_bytes()
+    assert "'categories': ['box', 'mug']" in run("train.py")  # the same run, which is finished
+    assert (tmp_path / "runs/kitchen/checkpoint.safetensors").read_bytes() == before
 
 
 @pytest.mark.slow

@@ -478,6 +478,25 @@ def test_folder_and_generated_scenes_are_the_same(scene_folder):
 
 
 @pytest.mark.slow
+def test_labels_without_a_symmetry_have_the_one_the_model_declares(scene_folder, tmp_path):
+    from nolbo_ppl.io import read_jsonl, write_jsonl
+
+    rows = [row for _, row in read_jsonl(scene_folder / "scenes.jsonl")]
+    for row in rows:
+        row["image"] = str(scene_folder / row["image"])
+        for thing in row["objects"]:
+            del thing["symmetry"]
+    write_jsonl(tmp_path / "scenes.jsonl", rows)
+    declared = dataclasses.replace(tiny(), image_size=64, symmetry=tuple(range(2, 14)))
+    scenes = open_scenes(config(scenes=tmp_path), declared)
+    seen = 0
+    for index in range(len(scenes)):
+        np.testing.assert_array_equal(scenes[index].symmetry, scenes[index].category + 2)
+        seen += len(scenes[index].symmetry)
+    assert seen > 0
+
+
+@pytest.mark.slow
 def test_the_verb_writes_figures_and_pictures(scene_folder, tmp_path, capsys):
     """An untrained network from a folder of weights: everything is written, nothing is NaN."""
     from nolbo_ppl.inference.weights import save

@@ -372,7 +372,7 @@ def test_own_categories_train_by_the_command_line(
     for other in ({"categories": ("mug", "box")}, {"categories": ("box", "mug"), "symmetry": (1, 1)}):
         with pytest.raises(InputError, match="initial weights of other categories: got box mug of symmetry 2 1"):
             config_of(pair, tmp_path / "other", initial=start, **other).model()
-    with pytest.raises(InputError, match=r"scenes\.jsonl:\d+: objects\[0\]\.category: got '(box|mug)', expected one of aeroplane"):
+    with pytest.raises(InputError, match=r"scenes\.jsonl:\d+: objects\[0\]\.category: got '(box|mug)', expected one of"):
         run(config_of(pair, tmp_path / "preset"))
 
 
@@ -450,7 +450,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_term(
         ({"symmetry": (2, 1)}, "symmetry: got 2 for 0 categories, expected one for each of --categories"),
         ({"categories": ("box", "mug"), "symmetry": (2,)}, "symmetry: got 1 for 2 categories"),
         ({"categories": ("box",), "symmetry": (-1,)}, r"symmetry: got \(-1,\), expected 1 \(none\)"),
-        ({"scenes": None, "validation": None, "categories": ("car", "bus")}, "own categories: got generated scenes.*give --scenes"),
+        ({"scenes": None, "validation": None, "categories": ("car", "bus")}, "own categories: got generated.*give --scenes"),
     ],
 )
 def test_ill_formed_options(folders: tuple[Path, Path], tmp_path: Path, changes: dict[str, Any], match: str) -> None:

@@ -88,7 +88,7 @@ class SceneFolder:
             raise input_error("no such data set", got=path, expected=f"a folder with {SCENES}")
         self.categories, self.size = tuple(categories), size
         if symmetry is not None and len(symmetry) != len(self.categories):
-            raise input_error("symmetry", got=f"{len(symmetry)} values", expected=f"one of each of {len(self.categories)} categories")
+            raise input_error("symmetry", got=len(symmetry), expected=f"one of each of {len(self.categories)} categories")
         self._symmetries = CATEGORY_SYMMETRY if symmetry is None else dict(zip(self.categories, symmetry))
         self.records: list[SceneRecord] = []
         self.image_sizes: list[tuple[int, int]] = []

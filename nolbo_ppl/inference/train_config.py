@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.optimisation import OptimisationConfig
@@ -21,6 +22,8 @@ FREE_FIELDS = (
     "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
+OPTIONAL_FIELDS = ("categories", "symmetry")
+"""Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,11 @@ class TrainConfig:
     """Form of the orientation latent; the preset's by default."""
     instance_labels: bool = False
     """Give every instance of `scenes` a label: the latent is split in halves for category and instance."""
+    categories: tuple[str, ...] = ()
+    """Names of your own categories, in the order of their labels; the preset's by default."""
+    symmetry: tuple[int, ...] = ()
+    """Symmetry of each of `categories` about the vertical axis: 1 none, n for n-fold, 0 free; by default that of
+    `nolbo_ppl.categories` for the names known there, and 1 for others."""
     latent_dim: int | None = None
     """Dimensions of the shape latent; the preset's by default."""
     image_size: int | None = None
@@ -117,6 +125,14 @@ class TrainConfig:
             raise input_error("instance labels", got="generated scenes", do="give --scenes with its own instances")
         if self.validation is not None and self.scenes is None:
             raise input_error("held-out scenes without training scenes", do="give --scenes too")
+        if self.categories and self.scenes is None:
+            raise input_error("own categories", got="generated scenes, which show the twelve of `nolbo_ppl.categories`",
+                              do="give --scenes with labels of these names")
+        if self.symmetry and len(self.symmetry) != len(self.categories):
+            raise input_error("symmetry", got=f"{len(self.symmetry)} for {len(self.categories)} categories",
+                              expected="one for each of --categories")
+        if any(order < 0 for order in self.symmetry):
+            raise input_error("symmetry", got=self.symmetry, expected="1 (none), n (n-fold) or 0 (free) for each category")
 
     def model(self) -> ModelConfig:
         """Configuration of the networks. Raises `InputError` where initial weights and other fields disagree."""
@@ -127,8 +143,17 @@ class TrainConfig:
                     "initial weights of another form", got=f"orientation {config.orientation}, {config.latent_dim} dimensions",
                     do="leave --orientation and --latent-dim out",
                 )
+            if self.categories not in ((), config.categories) or self.symmetry not in ((), config.symmetry):
+                raise input_error(
+                    "initial weights of other categories",
+                    got=f"{' '.join(config.categories)} of symmetry {' '.join(map(str, config.symmetry))}",
+                    expected=f"{' '.join(self.categories)} of symmetry {' '.join(map(str, self._symmetry()))}",
+                    do="leave --categories and --symmetry out, or train without --initial",
+                )
             return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)
         changes: dict[str, Any] = {}
+        if self.categories:
+            changes["categories"], changes["symmetry"] = self.categories, self._symmetry()
         if self.image_size is not None:
             changes["image_size"] = self.image_size
         if self.orientation is not None:
@@ -137,6 +162,10 @@ class TrainConfig:
         if self.latent_dim is not None:
             changes["latent_dim"] = self.latent_dim
         return dataclasses.replace(PRESETS[self.preset](), **changes)
+
+    def _symmetry(self) -> tuple[int, ...]:
+        """Declared symmetry of each of `categories`."""
+        return self.symmetry or tuple(CATEGORY_SYMMETRY.get(name, 1) for name in self.categories)
 
     def stages(self) -> list[Stage]:
         """The stages that have steps."""
@@ -170,4 +199,5 @@ class TrainConfig:
 
     def identity(self) -> dict[str, Any]:
         """What a checkpoint must agree with: everything but the fields that do not touch what is learnt."""
-        return {key: value for key, value in self.to_json().items() if key not in FREE_FIELDS}
+        values = self.to_json()
+        return {k: v for k, v in values.items() if k not in FREE_FIELDS and (v or k not in OPTIONAL_FIELDS)}

@@ -245,7 +245,7 @@ def test_declared_symmetry_is_that_of_objects_that_state_none(user: Callable[...
     folder = user(line)
     assert SceneFolder(folder, ("box", "mug")).batch([0])["symmetry"][0, :3].tolist() == [1, 4, 1]
     assert SceneFolder(folder, ("box", "mug"), symmetry=(1, 2)).batch([0])["symmetry"][0, :3].tolist() == [2, 4, 1]
-    with pytest.raises(InputError, match="symmetry: got 1 values, expected one of each of 2 categories"):
+    with pytest.raises(InputError, match="symmetry: got 1, expected one of each of 2 categories"):
         SceneFolder(folder, ("box", "mug"), symmetry=(1,))
 
 
