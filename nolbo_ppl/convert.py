@@ -18,7 +18,6 @@ from nolbo_ppl.data.convert import (
     convert_ycbv_slam,
     write_converted,
 )
-from nolbo_ppl.errors import NolboError
 
 
 @dataclass(frozen=True)
@@ -135,16 +134,12 @@ def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
     source: KittiObject | KittiPoles | KittiTracking | YcbvSlam
     source = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
-    try:
-        if isinstance(source, KittiObject):
-            written = source.write()
-        else:
-            data = source.convert()
-            write_converted(source.out, data)
-            written = f"{len(data.odometry)} frames, {len(data.observations)} observations"
-    except NolboError as error:
-        sys.stderr.write(f"error: {error}\n")
-        raise SystemExit(1) from None
+    if isinstance(source, KittiObject):
+        written = source.write()
+    else:
+        data = source.convert()
+        write_converted(source.out, data)
+        written = f"{len(data.odometry)} frames, {len(data.observations)} observations"
     sys.stdout.write(f"{written} written to {source.out}\n")
 
 

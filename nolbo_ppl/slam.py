@@ -120,11 +120,7 @@ def describe(report: dict[str, object]) -> str:
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo slam`."""
     arguments = tyro.cli(SlamArguments, prog="nolbo slam", args=args)
-    try:
-        _, report = run(arguments)
-    except NolboError as error:
-        sys.stderr.write(f"error: {error}\n")
-        raise SystemExit(1) from None
+    _, report = run(arguments)
     sys.stdout.write(describe(report) + f"\nwritten to {arguments.out}\n")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nolbo_ppl.convert import main
+from nolbo_ppl.cli import main
 from nolbo_ppl.data.observations import read_observations
 from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.geometry.pose import make_pose
@@ -19,7 +19,7 @@ def test_poles_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         write_trajectory(tmp_path / name / "00.txt", Trajectory(T))
     (tmp_path / "poles").mkdir()
     np.save(tmp_path / "poles" / "00.npy", np.array([[15.0, 5.0]]))
-    main(["kitti-poles", "--data", str(tmp_path), "--sequence", "00", "--out", str(tmp_path / "out"), "--every", "2"])
+    main(["convert", "kitti-poles", "--data", str(tmp_path), "--sequence", "00", "--out", str(tmp_path / "out"), "--every", "2"])
     assert "5 frames" in capsys.readouterr().out
     assert len(read_trajectory(tmp_path / "out" / "odometry.txt")) == 5
     assert len(read_observations(tmp_path / "out" / "observations.jsonl", frames=5)) > 0
@@ -29,7 +29,8 @@ def test_poles_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 def test_missing_data_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        main(["ycbv-slam", "--data", str(tmp_path), "--sequence", "0001", "--out", str(tmp_path / "out")])
-    assert stop.value.code == 1
-    assert "sequence not found" in capsys.readouterr().err
+        main(["convert", "ycbv-slam", "--data", str(tmp_path), "--sequence", "0001", "--out", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("nolbo convert: ") and "sequence not found" in error
     assert not (tmp_path / "out").exists()

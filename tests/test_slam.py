@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nolbo_ppl.cli import main
 from nolbo_ppl.data.observations import write_observations
 from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.inference.weights import save
 from nolbo_ppl.models.calibration import Calibration
-from nolbo_ppl.slam import main
 from tests.factories import tiny_model
 
 
@@ -38,7 +38,7 @@ def arguments(folder: Path, out: Path, **change: str) -> list[str]:
         "out": str(out),
         **change,
     }
-    return [part for name, value in values.items() for part in (f"--{name}", value)]
+    return ["slam", *(part for name, value in values.items() for part in (f"--{name}", value))]
 
 
 def test_every_file_is_written(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -127,7 +127,7 @@ def test_errors_go_to_stderr_and_nothing_is_written(
     (tmp_path / "bad").write_text(text)
     with pytest.raises(SystemExit) as stop:
         main(arguments(folder, tmp_path / "out", **{name: str(tmp_path / "bad")}))
-    assert stop.value.code == 1
+    assert stop.value.code == 2
     assert re.search(match, capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
 
@@ -141,7 +141,8 @@ def test_interruption_leaves_no_half_written_file(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(export, "association_rows", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(SystemExit) as stop:
         main([*arguments(folder, tmp_path), "--config.em-iterations", "1"])
+    assert stop.value.code == 130
     assert sorted(p.name for p in tmp_path.iterdir()) == ["iterations.npz", "landmarks.json", "trajectory.txt"]
     json.loads((tmp_path / "landmarks.json").read_text())
