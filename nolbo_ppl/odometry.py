@@ -13,7 +13,7 @@ import numpy as np
 
 from nolbo_ppl import __version__
 from nolbo_ppl.data.frames import FrameSequence, open_frames, read_intrinsics, read_lengths
-from nolbo_ppl.data.trajectories import Trajectory, match_times, read_trajectory, write_trajectory
+from nolbo_ppl.data.trajectories import COVARIANCE, Trajectory, poses_of_frames, write_trajectory
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.visual_odometry import (
     GroundHeight,
@@ -94,18 +94,8 @@ def true_poses(path: Path, part: Part) -> np.ndarray:
     Raises:
         InputError: rows that match the sequence neither in number nor by time.
     """
-    truth = read_trajectory(path)
-    if len(truth) == len(part.frames):
-        return truth.T_world_camera[part.first : part.first + len(part)]
-    if len(truth) == len(part):
-        return truth.T_world_camera
-    times = frame_times(part)
-    if truth.times is None or times is None:
-        raise input_error("truth does not match the frames", got=f"{len(truth)} rows", expected=f"{len(part.frames)}", file=path)
-    rows, partner = match_times(times, truth.times)
-    if len(rows) < len(part):
-        raise input_error("truth lacks times of the frames", got=f"{len(rows)} of {len(part)} matched within 20 ms", file=path)
-    return truth.T_world_camera[partner]
+    rows = slice(part.first, part.first + len(part))
+    return poses_of_frames(path, len(part.frames), part.frames.times, rows)
 
 
 def known_lengths(path: Path, part: Part) -> np.ndarray:
@@ -153,7 +143,7 @@ def write_odometry(out: Path, odometry: Odometry, times: np.ndarray | None, repo
     """Write odometry.txt (KITTI rows), odometry_covariance.npz, times.txt where known, and odometry.json, each atomically."""
     out.mkdir(parents=True, exist_ok=True)
     write_trajectory(out / "odometry.txt", Trajectory(odometry.T_world_camera))
-    with atomic_path(out / "odometry_covariance.npz") as temporary:
+    with atomic_path(out / COVARIANCE) as temporary:
         np.savez(temporary, covariance=odometry.covariance, matches=odometry.matches, inliers=odometry.inliers,
                  flags=odometry.flags)
     if times is not None:

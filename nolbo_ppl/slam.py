@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import tyro
 
 from nolbo_ppl.data.observations import read_observations
-from nolbo_ppl.data.trajectories import Trajectory, match_times, read_trajectory
-from nolbo_ppl.errors import NolboError, input_error
+from nolbo_ppl.data.trajectories import poses_of_frames, read_covariance, read_trajectory
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.export import write_result
 
@@ -40,46 +37,6 @@ class SlamArguments:
     """Settings."""
 
 
-def matched_truth(odometry: Trajectory, path: Path) -> np.ndarray:
-    """True poses of the odometry's rows.
-
-    Raises:
-        InputError: the rows do not match, by number (KITTI) or time (TUM).
-    """
-    truth = read_trajectory(path)
-    if len(truth) == len(odometry):
-        return truth.T_world_camera
-    if truth.times is None or odometry.times is None:
-        raise input_error("truth does not match the odometry row by row", got=f"{len(truth)} rows",
-                          expected=f"{len(odometry)} rows", file=path)
-    rows, partner = match_times(odometry.times, truth.times)
-    if len(rows) < len(odometry):
-        raise input_error(
-            "truth lacks times of the odometry",
-            got=f"{len(rows)} of {len(odometry)} rows matched within 20 ms",
-            file=path,
-        )
-    return truth.T_world_camera[partner]
-
-
-def read_covariance(path: Path) -> np.ndarray:
-    """Array `covariance` of an NPZ file.
-
-    Raises:
-        InputError: no such file, or it holds no such array.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if "covariance" not in file.files:
-                raise input_error("no array `covariance`", got=file.files, file=path)
-            return np.asarray(file["covariance"], dtype=np.float64)
-    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
-        if isinstance(error, NolboError):
-            raise
-        raise input_error("odometry covariance cannot be read", got=str(error), expected="an NPZ file with `covariance`",
-                          file=path) from None
-
-
 def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     """Read, solve, write; returns the result and the summary.
 
@@ -88,7 +45,9 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     """
     odometry = read_trajectory(arguments.odometry)
     table = read_observations(arguments.observations, frames=len(odometry))
-    truth = None if arguments.truth is None else matched_truth(odometry, arguments.truth)
+    truth = None
+    if arguments.truth is not None:
+        truth = poses_of_frames(arguments.truth, len(odometry), odometry.times, of="the odometry")
     covariance = None if arguments.odometry_covariance is None else read_covariance(arguments.odometry_covariance)
     problem = SlamProblem(odometry.T_world_camera, table, covariance)
     model = None

@@ -113,5 +113,5 @@ def test_lengths_and_truth_of_another_sequence(drive: Path, tmp_path: Path) -> N
     with pytest.raises(InputError, match=r"wheel\.txt: lengths do not match the frames: got 2 lengths, expected 5"):
         main(arguments(drive, tmp_path, "--scale", "file", "--lengths", tmp_path / "wheel.txt"))
     write_trajectory(tmp_path / "truth.txt", Trajectory(np.tile(np.eye(4), (3, 1, 1))))
-    with pytest.raises(InputError, match=r"truth\.txt: truth does not match the frames: got 3 rows, expected 6"):
+    with pytest.raises(InputError, match=r"truth\.txt: truth does not match the frames row by row: got 3 rows, expected 6"):
         main(arguments(drive, tmp_path, "--scale", "truth", "--truth", tmp_path / "truth.txt"))

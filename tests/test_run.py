@@ -182,7 +182,7 @@ def test_covariances_beside_an_odometry_come_with_it(known: SimulatedDrive, tmp_
         ({"odometry": None, "truth": None}, "visual odometry without a scale"),
         ({"intrinsics": Path("nothing.json")}, "no such file"),
         ({"images": Path("nowhere")}, "nowhere"),
-        ({"truth": "short"}, "poses do not match the images"),
+        ({"truth": "short"}, "truth does not match the images row by row: got 5 rows, expected 120"),
     ],
 )
 def test_bad_input_is_refused(known: SimulatedDrive, tmp_path: Path, change: dict[str, Any], match: str) -> None:

@@ -1,7 +1,9 @@
-"""Trajectories on disk: KITTI (12 numbers a row) and TUM (`time x y z qx qy qz qw`), poses `T_world_camera`."""
+"""Trajectories on disk: KITTI (12 numbers a row) and TUM (`time x y z qx qy qz qw`), poses `T_world_camera`; what belongs to
+their rows: frames of a sequence, covariances of the steps."""
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -10,11 +12,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.errors import input_error
+from nolbo_ppl.errors import InputError, input_error
 from nolbo_ppl.geometry.pose import is_rotation, make_pose, matrix_to_quaternion, nearest_rotation, quaternion_to_matrix
 from nolbo_ppl.io import atomic_path
 
 TrajectoryFormat = Literal["kitti", "tum"]
+Covariances = Float[np.ndarray, "n-1 6 6"]
+COVARIANCE = "odometry_covariance.npz"
+"""File of the covariances of an odometry's steps, beside it."""
+TIME_TOLERANCE = 0.02
+"""How far, in s, the times of a frame and its pose may lie apart."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +124,7 @@ def write_trajectory(path: str | PathLike[str], trajectory: Trajectory) -> None:
 
 
 def match_times(
-    reference: Float[np.ndarray, " n"], other: Float[np.ndarray, " m"], tolerance: float = 0.02
+    reference: Float[np.ndarray, " n"], other: Float[np.ndarray, " m"], tolerance: float = TIME_TOLERANCE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Indices of rows of both whose times agree within `tolerance` seconds, each row used once at most."""
     nearest = np.clip(np.searchsorted(other, reference), 1, max(len(other) - 1, 1))
@@ -133,3 +140,69 @@ def match_times(
             keep.append(int(i))
     rows = np.array(sorted(keep), dtype=int)
     return rows, nearest[rows]
+
+
+def poses_of_frames(
+    path: str | PathLike[str], frames: int, times: Float[np.ndarray, " f"] | None = None, part: slice = slice(None), *,
+    what: str = "truth", of: str = "the frames",
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses of a sequence's frames, or of a part of them: rows in the order of the frames, or TUM rows matched by time.
+
+    Args:
+        path: the trajectory: a row for each frame of the sequence, one for each of the part, or rows with times.
+        frames: number of frames of the sequence.
+        times: their times, s, where all are known.
+        part: the frames wanted.
+        what: what the trajectory is, for the messages.
+        of: what the frames are, for the messages.
+
+    Raises:
+        InputError: the trajectory is malformed, or matches neither in number nor by time; names the file.
+    """
+    found, count = read_trajectory(path), len(range(frames)[part])
+    if len(found) == frames:
+        return found.T_world_camera[part]
+    if len(found) == count:
+        return found.T_world_camera
+    if found.times is None or times is None:
+        raise input_error(
+            f"{what} does not match {of} row by row", got=f"{len(found)} rows", expected=f"{frames} rows", file=path
+        )
+    rows, partner = match_times(times[part], found.times)
+    if len(rows) < count:
+        raise input_error(
+            f"{what} lacks times of {of}", got=f"{len(rows)} of {count} matched within {1000 * TIME_TOLERANCE:.0f} ms",
+            expected="a pose for each", file=path,
+        )  # fmt: skip
+    return found.T_world_camera[partner]
+
+
+def read_covariance(path: str | PathLike[str]) -> Covariances:
+    """Covariances of an odometry's steps, [rotation rad, translation m] at the later camera: `covariance` of an NPZ file.
+
+    Raises:
+        InputError: no such file, or it holds no such array; names the file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if "covariance" not in file.files:
+                raise input_error("no array `covariance`", got=file.files, file=path)
+            covariance = np.asarray(file["covariance"], dtype=np.float64)
+    except InputError:
+        raise
+    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
+        raise input_error("odometry covariance cannot be read", got=error, expected="an NPZ file with `covariance`",
+                          file=path) from None
+    if covariance.ndim != 3 or covariance.shape[1:] != (6, 6):
+        raise input_error("`covariance`", got=covariance.shape, expected="[n - 1, 6, 6], one a step", file=path)
+    return covariance
+
+
+def covariance_beside(trajectory: str | PathLike[str]) -> Covariances | None:
+    """Covariances of the steps of an odometry from `odometry_covariance.npz` beside it; None where there is none.
+
+    Raises:
+        InputError: a file that cannot be read; names it.
+    """
+    path = Path(trajectory).parent / COVARIANCE
+    return read_covariance(path) if path.is_file() else None

@@ -109,6 +109,15 @@ def transform(T_a_b: Float[np.ndarray, "... 4 4"], points_b: Float[np.ndarray, "
     return np.einsum("...ij,...j->...i", T_a_b[..., :3, :3], points_b) + T_a_b[..., :3, 3]
 
 
+def adjoint(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6 6"]:
+    """Adjoint of rigid motions for twists [rotation, translation]: `T Exp(xi) T^-1 = Exp(Ad xi)`."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    result = np.zeros((*T.shape[:-2], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = R
+    result[..., 3:, :3] = skew(t) @ R
+    return result
+
+
 def se3_exp(xi: Float[np.ndarray, "... 6"]) -> Float[np.ndarray, "... 4 4"]:
     """Exponential of twists [omega, v] (rotation first, as in GTSAM)."""
     xi = np.asarray(xi, dtype=np.float64)

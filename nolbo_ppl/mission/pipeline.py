@@ -15,7 +15,7 @@ import numpy as np
 
 from nolbo_ppl.data.frames import open_frames, write_camera
 from nolbo_ppl.data.observations import read_observations
-from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
+from nolbo_ppl.data.trajectories import Trajectory, covariance_beside, read_trajectory, write_trajectory
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.pyramid import Pyramid
 from nolbo_ppl.inference.queries import ObservationModel
@@ -38,7 +38,7 @@ from nolbo_ppl.mission.observe import (
 from nolbo_ppl.mission.scene import build_scene, write_glb
 from nolbo_ppl.mission.sequence import Drive, estimate_or_read, keyframe_rows, open_drive
 from nolbo_ppl.mission.stages import Stage, run_stages
-from nolbo_ppl.mission.summary import read_covariance, summarise
+from nolbo_ppl.mission.summary import summarise
 
 
 class Mission:
@@ -82,7 +82,7 @@ class Mission:
         """What SLAM is given."""
         odometry = read_trajectory(self.out / "odometry.txt").T_world_camera
         table = read_observations(self.out / "observations.jsonl", frames=len(odometry))
-        return SlamProblem(odometry, table, odometry_covariance=read_covariance(self.out / "odometry_covariance.npz"))
+        return SlamProblem(odometry, table, odometry_covariance=covariance_beside(self.out / "odometry.txt"))
 
     @property
     def truth(self) -> np.ndarray | None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from nolbo_ppl.data.frames import CameraIntrinsics, FrameSequence, ImageFolder, open_frames, read_camera, read_lengths
-from nolbo_ppl.data.trajectories import match_times, read_trajectory
+from nolbo_ppl.data.trajectories import covariance_beside, poses_of_frames
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.visual_odometry import (
     GroundHeight,
@@ -23,7 +23,6 @@ from nolbo_ppl.inference.visual_odometry import (
     lengths_of,
 )
 from nolbo_ppl.mission.config import RunConfig
-from nolbo_ppl.mission.summary import read_covariance
 
 Poses = Float[np.ndarray, "n 4 4"]
 
@@ -91,23 +90,6 @@ class FoundOdometry:
         return chosen.T_world_camera, chosen.covariance if self.stated else None
 
 
-def poses_of_images(path: Path, count: int, times: Float[np.ndarray, " n"] | None) -> Poses:
-    """A pose for each image: rows in the order of the images, or TUM rows matched by time.
-
-    Raises:
-        InputError: neither fits.
-    """
-    found = read_trajectory(path)
-    if len(found) == count:
-        return found.T_world_camera
-    if found.times is None or times is None:
-        raise input_error("poses do not match the images", got=f"{len(found)} rows", expected=f"{count}, one an image", file=path)
-    rows, partner = match_times(times, found.times)
-    if len(rows) < count:
-        raise input_error("poses lack times of the images", got=f"{len(rows)} of {count} matched within 20 ms", file=path)
-    return found.T_world_camera[partner]
-
-
 def open_drive(config: RunConfig) -> Drive:
     """Open images, camera and truth.
 
@@ -116,7 +98,7 @@ def open_drive(config: RunConfig) -> Drive:
     """
     frames = open_frames(config.images)
     camera = read_camera(config.intrinsics, frames.size)
-    truth = None if config.truth is None else poses_of_images(config.truth, len(frames), frames.times)
+    truth = None if config.truth is None else poses_of_frames(config.truth, len(frames), frames.times, of="the images")
     return Drive(frames, camera, np.arange(0, len(frames), config.every), truth)
 
 
@@ -161,8 +143,9 @@ def estimate_or_read(drive: Drive, config: RunConfig) -> FoundOdometry:
             Every(drive.frames, drive.used), drive.intrinsics, scale_of(drive, config), config.visual, progress=True
         )
         return FoundOdometry(found, stated=True)
-    poses = poses_of_images(config.odometry, len(drive.frames), drive.frames.times)
-    covariance = read_covariance(config.odometry.parent / "odometry_covariance.npz")
+    frames = drive.frames
+    poses = poses_of_frames(config.odometry, len(frames), frames.times, what="odometry", of="the images")
+    covariance = covariance_beside(config.odometry)
     stated = covariance is not None and len(covariance) == len(poses) - 1
     n = len(poses) - 1
     every = Odometry(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.data.observations import ObservationTable, read_observations
-from nolbo_ppl.data.trajectories import read_trajectory
+from nolbo_ppl.data.trajectories import covariance_beside, read_trajectory
 from nolbo_ppl.inference.slam import NoiseModel, SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.inference.slam.export import trajectory_errors
 from nolbo_ppl.io import read_json, read_jsonl
@@ -72,14 +72,6 @@ class RunResult:
         return np.array([stands(row) for row in self.landmarks], dtype=bool)
 
 
-def read_covariance(path: Path) -> Float[np.ndarray, "n-1 6 6"] | None:
-    """Covariances of the odometry's steps, None where there is no file."""
-    if not path.is_file():
-        return None
-    with np.load(path, allow_pickle=False) as arrays:
-        return np.asarray(arrays["covariance"], dtype=np.float64)
-
-
 def read_result(folder: Path) -> RunResult:
     """Read what the stages before have written."""
     odometry = read_trajectory(folder / "odometry.txt").T_world_camera
@@ -99,7 +91,7 @@ def read_result(folder: Path) -> RunResult:
         odometry=odometry,
         estimate=read_trajectory(folder / "slam" / "trajectory.txt").T_world_camera,
         truth=read_trajectory(truth).T_world_camera if truth.is_file() else None,
-        covariance=read_covariance(folder / "odometry_covariance.npz"),
+        covariance=covariance_beside(folder / "odometry.txt"),
         landmarks=landmarks,
         landmark_of=landmark_of,
         slam=read_json(folder / "slam" / "summary.json"),

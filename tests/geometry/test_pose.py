@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from nolbo_ppl.geometry.pose import (
+    adjoint,
     chain,
     inverse,
     is_rotation,
@@ -79,3 +80,11 @@ def test_means_and_projections_are_rotations() -> None:
     assert rotation_angle(mean_rotation(R).T @ so3_exp(np.array([0.3, -0.4, 1.0]))) < 5 * 0.05 * np.sqrt(3 / 500)
     assert np.linalg.det(nearest_rotation(-np.eye(3) + 0.1 * rng.standard_normal((3, 3)))) == pytest.approx(1.0)
     assert not is_rotation(np.diag([1.0, 1.0, -1.0]))
+
+
+def test_the_adjoint_carries_a_twist() -> None:
+    rng = np.random.default_rng(0)
+    T, xi = se3_exp(rng.standard_normal((5, 6))), 0.3 * rng.standard_normal((5, 6))
+    carried = np.einsum("nij,nj->ni", adjoint(T), xi)
+    np.testing.assert_allclose(T @ se3_exp(xi) @ inverse(T), se3_exp(carried), atol=1e-12)
+    np.testing.assert_array_equal(adjoint(T[0]), adjoint(T)[0])

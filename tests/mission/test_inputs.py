@@ -11,27 +11,13 @@ import pytest
 from PIL import Image
 
 from nolbo_ppl.data.frames import open_frames
-from nolbo_ppl.data.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.visual_odometry import GroundHeight, KnownLengths
 from nolbo_ppl.mission.config import RunConfig
 from nolbo_ppl.mission.depth import DepthScale
 from nolbo_ppl.mission.observe import DepthPictures, SequenceDepth, StereoPairs, beside, observed_rows
-from nolbo_ppl.mission.sequence import lengths_between, open_drive, poses_of_images, scale_of
+from nolbo_ppl.mission.sequence import lengths_between, open_drive, scale_of
 from tests.mission.conftest import CAMERA, SimulatedDrive
-
-
-def test_poses_by_row_or_by_time(drive: SimulatedDrive, tmp_path: Path) -> None:
-    write_trajectory(tmp_path / "rows.txt", Trajectory(drive.truth[:6]))
-    np.testing.assert_allclose(poses_of_images(tmp_path / "rows.txt", 6, None), drive.truth[:6], atol=1e-9)
-    times = 50.0 + 0.05 * np.arange(12)
-    write_trajectory(tmp_path / "timed.txt", Trajectory(drive.truth[:12], times, "tum"))
-    found = poses_of_images(tmp_path / "timed.txt", 4, times[[1, 4, 5, 9]] + 0.003)
-    np.testing.assert_allclose(found, drive.truth[[1, 4, 5, 9]], atol=1e-9)
-    with pytest.raises(InputError, match="poses lack times of the images: got 3 of 4"):
-        poses_of_images(tmp_path / "timed.txt", 4, np.array([*times[:3], 99.0]))
-    with pytest.raises(InputError, match="poses do not match the images"):
-        poses_of_images(tmp_path / "rows.txt", 4, times[:4])
 
 
 def test_where_lengths_come_from(drive: SimulatedDrive, tmp_path: Path) -> None:

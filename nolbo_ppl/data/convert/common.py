@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nolbo_ppl.data.observations import ObservationTable, write_observations
-from nolbo_ppl.data.trajectories import Trajectory, write_trajectory
+from nolbo_ppl.data.trajectories import COVARIANCE, Trajectory, write_trajectory
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io import atomic_path, write_json
 
@@ -46,7 +46,7 @@ def write_converted(out: str | PathLike[str], data: Converted) -> None:
     write_trajectory(out / "odometry.txt", data.odometry)
     write_trajectory(out / "truth.txt", data.truth)
     if data.odometry_covariance is not None:
-        with atomic_path(out / "odometry_covariance.npz") as temporary:
+        with atomic_path(out / COVARIANCE) as temporary:
             np.savez_compressed(temporary, covariance=data.odometry_covariance)
     write_observations(out / "observations.jsonl", data.observations)
     write_json(out / "objects.json", {

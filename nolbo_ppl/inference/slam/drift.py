@@ -16,7 +16,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import skew
+from nolbo_ppl.geometry.pose import adjoint, skew
 
 MOST_NODES = 256
 """Nodes beyond which every second one goes."""
@@ -41,11 +41,8 @@ class DriftGraph:
 
     def advance(self, T_world_camera: Float[np.ndarray, "4 4"], rotation: float, translation: float) -> None:
         """Add the noise of one odometry step that ends at this pose."""
-        R, p = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        adjoint = np.zeros((6, 6))
-        adjoint[:3, :3] = adjoint[3:, 3:] = R
-        adjoint[3:, :3] = skew(p) @ R
-        self.pending = self.pending + (adjoint * np.repeat([rotation**2, translation**2], 3)) @ adjoint.T
+        carry = adjoint(T_world_camera)
+        self.pending = self.pending + (carry * np.repeat([rotation**2, translation**2], 3)) @ carry.T
         self.since += 1
         if self.since < self.stride:
             return

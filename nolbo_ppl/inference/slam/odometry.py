@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from nolbo_ppl.geometry.pose import inverse, se3_log, skew
+from nolbo_ppl.geometry.pose import adjoint, inverse, se3_log
 from nolbo_ppl.inference.slam.config import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.graph import (
     Estimate,
@@ -132,12 +132,7 @@ def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[flo
     step = inverse(T[:-1]) @ T[1:]
     measured = inverse(state.problem.odometry[:-1]) @ state.problem.odometry[1:]
     mean = se3_log(inverse(measured) @ step)
-    back = inverse(step)
-    R, t = back[:, :3, :3], back[:, :3, 3]
-    adjoint = np.zeros((len(step), 6, 6))
-    adjoint[:, :3, :3] = adjoint[:, 3:, 3:] = R
-    adjoint[:, 3:, :3] = skew(t) @ R
-    square = mean**2 + np.mean((delta[1:] - adjoint @ delta[:-1]) ** 2, axis=2)
+    square = mean**2 + np.mean((delta[1:] - adjoint(inverse(step)) @ delta[:-1]) ** 2, axis=2)
     rotation = np.sqrt(np.mean(square[:, :3] / state.noise.rotation_step[:, None] ** 2))
     translation = np.sqrt(np.mean(square[:, 3:] / state.noise.translation_step[:, None] ** 2))
     return float(rotation), float(translation)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nolbo_ppl.inference.visual_odometry.compose import adjoint, at_keyframes, between, compose_covariance, keyframes
+from nolbo_ppl.inference.visual_odometry.compose import at_keyframes, between, compose_covariance, keyframes
 from nolbo_ppl.inference.visual_odometry.config import (
     GroundHeight,
     KnownLengths,
@@ -34,7 +34,6 @@ __all__ = [
     "Step",
     "StepFlag",
     "VisualOdometry",
-    "adjoint",
     "at_keyframes",
     "between",
     "compose_covariance",

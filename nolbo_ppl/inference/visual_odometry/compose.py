@@ -9,17 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.pose import inverse, relative, rotation_angle, skew
+from nolbo_ppl.geometry.pose import adjoint, inverse, relative, rotation_angle
 from nolbo_ppl.inference.visual_odometry.odometry import Odometry
-
-
-def adjoint(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6 6"]:
-    """Adjoint of rigid motions for twists [rotation, translation]: `T Exp(xi) T^-1 = Exp(Ad xi)`."""
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    result = np.zeros((*T.shape[:-2], 6, 6))
-    result[..., :3, :3] = result[..., 3:, 3:] = R
-    result[..., 3:, :3] = skew(t) @ R
-    return result
 
 
 def compose_covariance(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.data.trajectories import match_times, read_trajectory
+from nolbo_ppl.data.trajectories import poses_of_frames, read_trajectory
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io import read_json, read_jsonl
 from nolbo_ppl.metrics.trajectory import align
@@ -129,27 +129,9 @@ def _json(path: Path) -> dict[str, Any]:
     return value
 
 
-def _rows(path: Path | None, count: int, what: str) -> Poses | None:
-    """Poses of an optional trajectory with as many rows as the estimate."""
-    if path is None:
-        return None
-    found = read_trajectory(path)
-    if len(found) != count:
-        raise input_error(f"{what} does not match the estimate row by row", got=f"{len(found)} rows",
-                          expected=f"{count} rows", file=path)
-    return found.T_world_camera
-
-
-def _truth_rows(path: Path | None, count: int, times: np.ndarray | None) -> Poses | None:
-    """True poses: rows of the estimate, or rows matched by time."""
-    if path is None:
-        return None
-    found = read_trajectory(path)
-    if len(found) != count and found.times is not None and times is not None:
-        rows, partner = match_times(times, found.times)
-        if len(rows) == count:
-            return found.T_world_camera[partner]
-    return _rows(path, count, "the truth")
+def _rows(path: Path | None, count: int, times: np.ndarray | None, what: str) -> Poses | None:
+    """Poses of an optional trajectory: rows of the estimate, or rows matched by time."""
+    return None if path is None else poses_of_frames(path, count, times, what=what, of="the estimate")
 
 
 def _iterations(path: Path, count: int) -> Iterations | None:
@@ -247,7 +229,7 @@ def read_run(
     estimate, count = answer.T_world_camera, len(answer)
     images, times = _frames(path, count)
     times = answer.times if times is None else times
-    truth_given = _truth_rows(place(truth, "truth.txt"), count, times)
+    truth_given = _rows(place(truth, "truth.txt"), count, times, "the truth")
     landmarks = read_landmarks(slam / "landmarks.json") if (slam / "landmarks.json").is_file() else ()
     names = [x.name for x in landmarks]
     associations = None
@@ -256,7 +238,7 @@ def read_run(
                                          _frame_of(place(observations, "observations.jsonl")))
     return RunFolder(
         path=path, slam=slam, estimate=estimate, landmarks=landmarks,
-        odometry=_rows(place(odometry, "odometry.txt"), count, "the odometry"),
+        odometry=_rows(place(odometry, "odometry.txt"), count, times, "the odometry"),
         truth=None if truth_given is None else align(truth_given, estimate), truth_given=truth_given,
         times=times, images=images, intrinsics=_json(path / "intrinsics.json") or None, associations=associations,
         iterations=_iterations(slam / "iterations.npz", count), objects=_objects(path / "objects.json"),

@@ -7,7 +7,7 @@ import pytest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import chain, inverse, relative, se3_exp, se3_log
-from nolbo_ppl.inference.visual_odometry import Odometry, adjoint, at_keyframes, between, compose_covariance, keyframes
+from nolbo_ppl.inference.visual_odometry import Odometry, at_keyframes, between, compose_covariance, keyframes
 
 
 def path(steps: np.ndarray, covariance: np.ndarray) -> Odometry:
@@ -18,12 +18,6 @@ def path(steps: np.ndarray, covariance: np.ndarray) -> Odometry:
 def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
     root = rng.standard_normal((n, 6, 6)) * np.repeat([0.004, 0.02], 3)[:, None]
     return root @ np.swapaxes(root, 1, 2)
-
-
-def test_the_adjoint_carries_a_twist() -> None:
-    rng = np.random.default_rng(0)
-    T, xi = se3_exp(rng.standard_normal(6)), 0.3 * rng.standard_normal(6)
-    np.testing.assert_allclose(T @ se3_exp(xi) @ inverse(T), se3_exp(adjoint(T) @ xi), atol=1e-12)
 
 
 def test_joined_covariance_is_that_of_samples() -> None:
