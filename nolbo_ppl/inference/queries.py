@@ -320,21 +320,25 @@ class ObservationModel:
     def _position_covariance(
         self, q: RegionParameters, box: Tensor, box_scale: Tensor, position: Tensor, camera: Tensor
     ) -> Float[Tensor, "n 3 3"]:
-        """Covariance of the position to first order: along the ray from the range, across it from the centre's pixel."""
+        """Covariance of the position to first order: along the ray from the range, across it from the centre's pixel.
+
+        With slopes s = (x, y) / z and n^2 = 1 + |s|^2 the position is e^r f n^(1/2) (s, 1) (`decode_range`): a pixel turns
+        the ray, and changes the range a little, for off the axis a radian covers more pixels.
+        """
         unit, loc = (q.range_loc.new_tensor(v) for v in (self.config.range_spread, self.config.range_loc))
         spread, offset = q.range_scale * unit, q.range_loc * unit + loc
         extent = box[:, 2:] - box[:, :2]
         # the centre's pixel = the box's centre + offset * extent: three independent errors an axis
         relative = spread[:, 1:3].square() + (offset[:, 1:3] * box_scale[:, 2:]).square()
         pixel_variance = box_scale[:, :2].square() + extent.square() * relative
-        ray = position / torch.linalg.vector_norm(position, dim=-1, keepdim=True)
         along = position[:, :, None] * position[:, None, :] * spread[:, 0, None, None].square()
         depth = position[:, 2]
         across = torch.zeros_like(along)
         for axis in range(2):
             step = torch.zeros_like(position)
             step[:, axis] = depth / camera[:, axis]
-            step = step - ray * (ray * step).sum(-1, keepdim=True)  # a pixel turns the ray and leaves the range
+            share = 0.5 * position[:, axis] * depth / position.square().sum(-1)  # s / (2 n^2)
+            step = step + position * (share / camera[:, axis])[:, None]
             across = across + step[:, :, None] * step[:, None, :] * pixel_variance[:, axis, None, None]
         return along + across
 

@@ -158,6 +158,15 @@ def focal_length(intrinsics: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
     return torch.sqrt(intrinsics[..., 0] * intrinsics[..., 1])
 
 
+def pixels_per_radian(ray: Float[Tensor, "*n 3"], intrinsics: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
+    """How many pixels a radian covers along a ray of the camera, of any length; geometric mean over its two directions.
+
+    A pinhole camera draws what lies off its axis larger: by 1 / cos of the angle across, by 1 / cos^2 away from the middle.
+    """
+    cosine = ray[..., 2] / torch.linalg.vector_norm(ray, dim=-1)
+    return focal_length(intrinsics) * cosine.clamp_min(1e-3) ** -1.5
+
+
 def encode_range(
     position: Float[Tensor, "*n 3"],
     diagonal: Float[Tensor, "*n"],
@@ -165,12 +174,14 @@ def encode_range(
     intrinsics: Float[Tensor, "*n 4"],
     config: ModelConfig,
 ) -> Float[Tensor, "*n 4"]:
-    """Position and size -> latent units: log(range / focal length), centre's offset in box sizes, log diagonal.
+    """Position and size -> latent units: log(range / pixels per radian), centre's offset in box sizes, log diagonal.
 
-    The range is divided by the focal length in px, since an image shows their ratio only: the same network then serves
-    any camera and any scale of the image.
+    The range is divided by what the camera makes of a radian there, in px, since an image shows their ratio only: the same
+    network then serves any camera, any scale of the image, and objects far off the axis of a wide lens, which it cannot tell
+    from nearer ones before it.
     """
-    log_range = torch.log(torch.linalg.vector_norm(position, dim=-1) / focal_length(intrinsics))
+    distance = torch.linalg.vector_norm(position, dim=-1)
+    log_range = torch.log(distance / pixels_per_radian(position, intrinsics))
     size = (box[..., 2:] - box[..., :2]).clamp_min(1e-3)
     offset = (project(position, intrinsics) - (box[..., :2] + box[..., 2:]) / 2) / size
     raw = torch.cat((log_range[..., None], offset, torch.log(diagonal)[..., None]), -1)
@@ -183,8 +194,9 @@ def decode_range(
     """Inverse of `encode_range`: position in the camera frame (m) and box diagonal (m)."""
     raw = latent * latent.new_tensor(config.range_spread) + latent.new_tensor(config.range_loc)
     pixel = (box[..., :2] + box[..., 2:]) / 2 + raw[..., 1:3] * (box[..., 2:] - box[..., :2])
-    distance = torch.exp(raw[..., 0]) * focal_length(intrinsics)
-    return distance[..., None] * pixel_ray(pixel, intrinsics), torch.exp(raw[..., 3])
+    ray = pixel_ray(pixel, intrinsics)
+    distance = torch.exp(raw[..., 0]) * pixels_per_radian(ray, intrinsics)
+    return distance[..., None] * ray, torch.exp(raw[..., 3])
 
 
 def pack_bits(voxels: Bool[Tensor, "*n v v v"]) -> UInt8[Tensor, "*n bytes"]:

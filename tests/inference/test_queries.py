@@ -214,9 +214,10 @@ def test_double_resolution_gives_the_same_metres() -> None:
     np.testing.assert_allclose(b.position_covariance, a.position_covariance, rtol=0.1, atol=1e-3 * a.position_covariance.max())
     one = model.observe(small, [50.0, 50.0, 32.0, 32.0], **options)
     again = model.observe(small, [100.0, 100.0, 32.0, 32.0], **options)
-    # the same picture through twice the focal length is twice as far away
+    # the same picture through twice the focal length is as much farther away as a radian then covers more pixels
     distance, twice = (np.linalg.norm(x.position, axis=1) for x in (one, again))
-    np.testing.assert_allclose(twice, 2 * distance)
+    cosine, closer = (x.position[:, 2] / np.linalg.norm(x.position, axis=1) for x in (one, again))
+    np.testing.assert_allclose(twice, 2 * (cosine / closer) ** 1.5 * distance, rtol=1e-5)
 
 
 def test_anisotropic_scaling_of_odd_sizes() -> None:

@@ -18,9 +18,9 @@ from nolbo_ppl.models.scene import (
     decode_range,
     encode_box,
     encode_range,
-    focal_length,
     grid_size,
     pack_bits,
+    pixels_per_radian,
     unpack_bits,
 )
 from tests.factories import random_batch, tiny_config
@@ -70,11 +70,30 @@ def test_range_round_trip() -> None:
     torch.testing.assert_close(diagonal, data["diagonal"])
     raw = latent * torch.tensor(CONFIG.range_spread) + torch.tensor(CONFIG.range_loc)
     distance = data["position"].norm(dim=-1)
-    torch.testing.assert_close(raw[:, 0].exp() * focal_length(data["camera"]), distance)
+    torch.testing.assert_close(raw[:, 0].exp() * pixels_per_radian(data["position"], data["camera"]), distance)
     centre = (data["box"][:, :2] + data["box"][:, 2:]) / 2
     size = data["box"][:, 2:] - data["box"][:, :2]
     torch.testing.assert_close(centre + raw[:, 1:3] * size, project(data["position"], data["camera"]))
     torch.testing.assert_close(raw[:, 3], data["diagonal"].log())
+
+
+def test_pixels_per_radian_are_those_of_a_small_cone() -> None:
+    """Against the area in pixels of a small cone about the ray, over its solid angle."""
+    camera = torch.tensor([[300.0, 280.0, 64.0, 60.0]]).double()
+    generator = torch.Generator().manual_seed(0)
+    for slope in ((0.0, 0.0), (0.9, -0.2), (-0.4, 1.1)):
+        ray = torch.tensor([*slope, 1.0]).double()
+        ray = ray / ray.norm()
+        side = torch.linalg.cross(ray, torch.tensor([0.3, 1.0, -0.2]).double())
+        side = side / side.norm()
+        other = torch.linalg.cross(ray, side)
+        turn = torch.rand(1, generator=generator).double() * 2 * math.pi + torch.linspace(0, 2 * math.pi, 721).double()
+        radius = 1e-4
+        rim = ray + radius * (turn.cos()[:, None] * side + turn.sin()[:, None] * other)
+        x, y = (rim[:, :2] / rim[:, 2:] * camera[0, :2]).unbind(-1)
+        area = 0.5 * (x[:-1] * y[1:] - x[1:] * y[:-1]).sum().abs()  # the shoelace formula
+        expected = torch.sqrt(area / (math.pi * radius**2))
+        torch.testing.assert_close(pixels_per_radian(3 * ray[None], camera)[0], expected, rtol=1e-4, atol=0)
 
 
 def test_range_does_not_depend_on_the_scale_of_the_image() -> None:
@@ -89,7 +108,8 @@ def test_range_does_not_depend_on_the_scale_of_the_image() -> None:
     zoomed = data["camera"] * torch.tensor([2.0, 2.0, 1.0, 1.0])
     ray_scale = torch.tensor([1.0, 1.0, 2.0])  # the same pixels through twice the focal length
     position = data["position"] * ray_scale
-    position = position * (2 * data["position"].norm(dim=-1) / position.norm(dim=-1))[:, None]
+    radian = [pixels_per_radian(x, c) for x, c in ((data["position"], data["camera"]), (position, zoomed))]
+    position = position * (radian[1] / radian[0] * data["position"].norm(dim=-1) / position.norm(dim=-1))[:, None]
     again = encode_range(position, data["diagonal"], data["box"], zoomed, CONFIG)
     torch.testing.assert_close(again, once)
 
