@@ -43,6 +43,8 @@ def shade_smoothly(view: View, hits: Hits, rays: int, contrast: float = CONTRAST
     if rays == 1:
         return colour
     rows, columns = np.nonzero(uneven(colour, contrast))
+    if not len(rows):  # a picture of one colour, as of a wall right before the camera
+        return colour
     position = (np.arange(rays) + 0.5) / rays
     offsets = np.stack(np.meshgrid(position, position), axis=-1).reshape(-1, 2)
     slopes, index, face, depth = trace_pixels(view, hits.windows, rows, columns, offsets)

@@ -83,6 +83,11 @@ def test_edges_are_as_smooth_as_with_several_rays_everywhere(view: View) -> None
     np.testing.assert_array_equal(shade_smoothly(view, hits, 1), jagged)
 
 
+def test_a_picture_of_one_colour_stays_as_it_is(view: View) -> None:
+    hits = trace(view)
+    np.testing.assert_array_equal(shade_smoothly(view, hits, 2, contrast=1e9), shade(view, hits))
+
+
 def test_uneven_pixels_are_those_beside_a_step() -> None:
     picture = np.full((5, 6, 3), 0.25)
     picture[2:, 3:, 1] = 0.36  # display 0.5 against 0.6
