@@ -14,7 +14,9 @@ import torch
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.boxes import pairwise_iou
 from nolbo_ppl.geometry.rotation import quaternion_to_matrix, ray_rotation, viewpoint_to_matrix
+from nolbo_ppl.inference.answers import position_covariance
 from nolbo_ppl.inference.observations import Observations, ViewpointModes
+from nolbo_ppl.inference.prepare import prepare
 from nolbo_ppl.inference.queries import ObservationModel
 from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.config import ModelConfig
@@ -261,7 +263,7 @@ def test_position_covariance_against_propagated_samples() -> None:
     box_scale = q.box_scale * torch.tensor(config.box_spread)
     box_scale[:, :2] *= config.stride
     position, _ = decode_range(q.range_loc, box, camera, config)
-    found = model._position_covariance(q, box, box_scale, position, camera)
+    found = position_covariance(q, box, box_scale, position, camera, config)
     torch.manual_seed(0)
     boxes = decode_box(q.box_loc + q.box_scale * torch.randn(draws, n, 4), cell, 4, config)
     samples, _ = decode_range(q.range_loc + q.range_scale * torch.randn(draws, n, 4), boxes, camera, config)
@@ -338,7 +340,7 @@ def test_given_boxes_are_answered_in_order() -> None:
     found, none = model.observe_boxes([image, image], camera, [boxes, np.zeros((0, 4))], decode=False)
     assert len(found) == 4
     assert len(none) == 0
-    prepared = model._prepare(image, camera, 64)
+    prepared = prepare(image, camera, 64, torch.float64)
     with torch.no_grad():
         encoding = model.model.guide.encode(prepared.image[None])
     for i, box in enumerate(boxes / 2):

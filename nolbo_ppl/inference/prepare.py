@@ -1,0 +1,115 @@
+"""Images and intrinsics of any origin, as the network takes them: checked, scaled to multiples of 32, batched by shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from nolbo_ppl.errors import input_error
+
+Image = UInt8[np.ndarray, "h w 3"] | UInt8[Tensor, "3 h w"]
+"""An image: a uint8 array of height x width x 3 colours, or a torch tensor with the colours first."""
+LEAST_SIDE = 8
+"""Least height and width of an image, px."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An image as the network takes it."""
+
+    image: UInt8[Tensor, "3 h w"]
+    """Scaled; both sides are multiples of 32."""
+    camera: Float[Tensor, " 4"]
+    """[fx, fy, cx, cy], px of the scaled image."""
+    scale: Float[np.ndarray, " 2"]
+    """Width and height of the scaled image over those of the given one."""
+
+
+def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 4"]:
+    """Intrinsics [fx, fy, cx, cy], px, of a camera that sees 60 degrees across: what is assumed when none are given."""
+    height, width = image.shape[:2]
+    focal = width / (2 * math.tan(math.radians(30)))
+    return np.array([focal, focal, width / 2, height / 2])
+
+
+def prepare(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> Prepared:
+    """Scale an image so that its longer side has the wanted size and both are multiples of 32.
+
+    Args:
+        image: see `Image`.
+        intrinsics: [fx, fy, cx, cy] in px of the given image; guessed when None.
+        size: longer side of the scaled image, px.
+        dtype: of the scaled intrinsics.
+
+    Raises:
+        InputError: no image, a tiny one, or intrinsics of no camera.
+    """
+    if isinstance(image, Tensor):
+        image = image.permute(1, 2, 0).numpy() if image.dim() == 3 else image.numpy()
+    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        got = (getattr(image, "shape", type(image).__name__), getattr(image, "dtype", ""))
+        raise input_error("an image", got=got, expected="a uint8 array of shape (height, width, 3)")
+    height, width = image.shape[:2]
+    if min(height, width) < LEAST_SIDE:
+        raise input_error("an image", got=f"{width} x {height} px", expected=f"at least {LEAST_SIDE} x {LEAST_SIDE} px")
+    if intrinsics is None:
+        camera = guessed_intrinsics(image)
+    else:
+        camera = np.asarray(intrinsics, dtype=np.float64)
+        if camera.shape != (4,) or not np.isfinite(camera).all() or (camera[:2] <= 0).any():
+            raise input_error("intrinsics", got=intrinsics, expected="[fx, fy, cx, cy] in px with positive fx, fy")
+    factor = size / max(height, width)
+    new = [max(32, round(side * factor / 32) * 32) for side in (width, height)]
+    if [width, height] != new:
+        from PIL import Image as PillowImage
+
+        image = np.asarray(PillowImage.fromarray(image).resize((new[0], new[1]), PillowImage.Resampling.BILINEAR))
+    scale = np.array([new[0] / width, new[1] / height])
+    tensor = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
+    return Prepared(tensor, torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype), scale)
+
+
+def prepare_all(images: Sequence[Any], intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> list[Prepared]:
+    """Images of any shapes, with intrinsics [4] for all or [n, 4], a row an image; see `prepare`.
+
+    Raises:
+        InputError: a size that is no positive multiple of 32, another number of intrinsics than of images, or what `prepare`
+            refuses.
+    """
+    if size <= 0 or size % 32:
+        raise input_error("size of the scaled images", got=size, expected="a positive multiple of 32")
+    return [prepare(image, intrinsics_of(intrinsics, i, len(images)), size, dtype) for i, image in enumerate(images)]
+
+
+def intrinsics_of(intrinsics: Any, index: int, count: int) -> Any:
+    """Intrinsics of one of `count` images, given for all at once or one an image; None where there are none.
+
+    Raises:
+        InputError: another number of rows than of images.
+    """
+    if intrinsics is None:
+        return None
+    values = np.asarray(intrinsics, dtype=np.float64)
+    if values.ndim == 1:
+        return values
+    if len(values) != count:
+        raise input_error("intrinsics", got=f"{len(values)} rows", expected=f"one for all or one for each of {count} images")
+    return values[index]
+
+
+def same_shape(prepared: Sequence[Prepared], batch: int) -> list[list[int]]:
+    """Groups of at most `batch` images of one shape, in order, as numbers of the images."""
+    groups: dict[tuple[int, ...], list[list[int]]] = {}
+    for i, one in enumerate(prepared):
+        of_shape = groups.setdefault(tuple(one.image.shape), [[]])
+        if len(of_shape[-1]) == batch:
+            of_shape.append([])
+        of_shape[-1].append(i)
+    return [group for of_shape in groups.values() for group in of_shape]
