@@ -1,6 +1,6 @@
 """`nolbo train`: stochastic variational inference in stages, from shapes to single objects to scenes.
 
-Stages (NOLBO, training details; method section 3): the shape autoencoder (decoder, prior networks, 3D encoder); the
+Stages (NOLBO, training details; docs/training.md): the shape autoencoder (decoder, prior networks, 3D encoder); the
 guide on images of one object; the guide on scenes, decoder and prior frozen. Every batch is a function of the seed and
 the step, checkpoints hold all that a step changes, and a killed run goes on exactly where its last checkpoint stands.
 Started by `torchrun`, several processes or machines share each batch.

@@ -50,7 +50,7 @@ def viewpoint_moments_to_matrix(
 
 
 def viewpoint_to_matrix(viewpoint: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """R_camera_object of a viewpoint (azimuth, elevation, in-plane) in radians (method section 0)."""
+    """R_camera_object of a viewpoint (azimuth, elevation, in-plane) in radians (PASCAL3D+; docs/story.md, conventions)."""
     return viewpoint_moments_to_matrix(torch.cos(viewpoint), torch.sin(viewpoint))
 
 
@@ -139,7 +139,7 @@ def ray_rotation(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def allocentric_to_egocentric(
     R_allocentric: Float[Tensor, "*batch 3 3"], ray: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """R_camera_object from the orientation relative to the ray through the object's centre (method section 0)."""
+    """R_camera_object from the orientation relative to the ray through the object's centre (docs/story.md, conventions)."""
     return ray_rotation(ray) @ R_allocentric
 
 

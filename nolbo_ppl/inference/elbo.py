@@ -1,4 +1,4 @@
-"""The evidence lower bound of a scene, by name, and the inclusive objective beside it (method section 3).
+"""The evidence lower bound of a scene, by name, and the inclusive objective beside it (NOLBO eq. ELBO; docs/bound.md).
 
 For each latent site of the guide the bound has one term, `-KL(q || p)`, analytic; for each observed site of the story
 one expected log likelihood, in closed form where the site carries one, else at the guide's sample. Discrete sites that

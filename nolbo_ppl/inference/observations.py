@@ -57,7 +57,7 @@ class Observations:
     class_log_posterior: Float[np.ndarray, "n labels"]
     """log q(l | I), normalised."""
     class_log_likelihood: Float[np.ndarray, "n labels"]
-    """log N(mu_q; mu_psi(l), I) of each category, whose argmax is the maximum-likelihood category (method section 4)."""
+    """log N(mu_q; mu_psi(l), I) of each category, whose argmax is the maximum-likelihood category (NOLBO eq. MLEproblemfinal)."""
     instance_log_posterior: Float[np.ndarray, "n instances"] | None
     """Normalised log posterior of known instances ("novel" last); None for models without instance labels."""
     latent: Float[np.ndarray, "n d"]
@@ -129,7 +129,7 @@ class Observations:
 
     def rotation_modes(self) -> RotationModes:
         """Every azimuth mode as an egocentric rotation: the guide's angles are seen along the ray through the object, so each
-        mode is turned by the smallest rotation from the optical axis to that ray (method section 0).
+        mode is turned by the smallest rotation from the optical axis to that ray (docs/story.md, conventions).
         """
         import torch
 

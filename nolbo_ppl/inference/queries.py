@@ -1,4 +1,4 @@
-"""Queries on the amortised posterior (method section 4): load a model, show it images, get distributions back."""
+"""Queries on the amortised posterior (NOLBO, appendix III): load a model, show it images, get distributions back."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class ObservationModel:
     ) -> list[Observations]:
         """Posterior of the region responsible for each given box (px of the given image), in the order of the boxes.
 
-        The responsible predictor is the one of the box's cell whose own box overlaps it most (method section 1).
+        The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation).
         """
         if len(boxes) != len(images):
             raise input_error("boxes", got=f"{len(boxes)} lists", expected=f"one list for each of {len(images)} images")

@@ -19,8 +19,8 @@ def rotation_error(
 ) -> Float[np.ndarray, " n"]:
     """Geodesic angle in rad between orientations, the least over the object's symmetry about its vertical axis.
 
-    `||log(R_estimate' R_truth)||_F / sqrt 2` for order 1 (method section 0); its minimum over the turns 2 pi j / n for
-    order n; for order 0 (a free axis) the minimum over all turns, which is the angle between the vertical axes.
+    `||log(R_estimate' R_truth)||_F / sqrt 2` for order 1 (the error of PASCAL3D+); its minimum over the turns 2 pi j / n
+    for order n; for order 0 (a free axis) the minimum over all turns, which is the angle between the vertical axes.
 
     Raises:
         InputError: shapes do not match or an order is negative.

@@ -53,7 +53,7 @@ class Encoder(Protocol):
 class TinyEncoder(nn.Module):
     """A small residual network of stride 16; the finer stride-8 features are folded into the channels of each cell.
 
-    Without the folded features small objects lose their box accuracy (method: findings on learning).
+    Without the folded features small objects lose their box accuracy.
     """
 
     stride = 16

@@ -239,7 +239,7 @@ def _select(raw: Float[Tensor, "b m p o"], predictor: Int[Tensor, "b m"]) -> Flo
 def assign_predictors(
     cell: Int[Tensor, "b m"], iou: Float[Tensor, "b m p"], present: Tensor
 ) -> tuple[Int[Tensor, "b m"], Tensor]:
-    """Responsible predictor of each object: in its cell, the free one with the highest IoU (method section 1).
+    """Responsible predictor of each object: in its cell, the free one with the highest IoU (NOLBO, implementation).
 
     Objects choose in the order of their best IoU, so that two objects of one cell get different predictors; an object
     that finds none free is left out (second result false).

@@ -1,4 +1,4 @@
-"""The generative story of a scene as a Pyro model (method section 1).
+"""The generative story of a scene as a Pyro model (NOLBO fig. 2; docs/story.md).
 
 Every region k of a scene has a label: an object's category (and instance), or background. The label throws the
 objectness; an object's label throws the shape latent, which the decoder turns into voxels; its viewpoint throws the

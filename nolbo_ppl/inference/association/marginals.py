@@ -50,7 +50,7 @@ def association_marginals(
     gate: float = GATE,
     k: int = 200,
 ) -> AssociationMarginals:
-    """Marginals of the joint association of n detections with m landmarks (method section 5, the E-step).
+    """Marginals of the joint association of n detections with m landmarks (the E-step, docs/em.md).
 
     Each detection goes to one landmark or to its own null hypothesis, each landmark takes at most one detection, and a
     joint association weighs the exponential of the sum of its entries. The derivative of `log_evidence` by

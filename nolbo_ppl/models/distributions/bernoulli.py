@@ -86,6 +86,6 @@ def log_kappa_objectness(
     """`log kappa_o = -KL(q(o) || p(o | label))`, NOLBO eq. (kappaforobjectness).
 
     For an object it is `H(q) + q log(1 - eps) + (1 - q) log eps`: not the probability of an object, which it meets only
-    at the ends (method section 2).
+    at the ends (docs/story.md, corrections).
     """
     return -objectness_kl_exclusive(logit, is_object, eps)

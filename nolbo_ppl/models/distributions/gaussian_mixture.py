@@ -32,7 +32,7 @@ def gaussian_mixture_log_prob(
 def kl_to_each_component(
     q_loc: Float[Tensor, "*batch d"], q_scale: Float[Tensor, "*batch d"], component_loc: Float[Tensor, "C d"]
 ) -> Float[Tensor, "*batch C"]:
-    """`KL(N(q_loc, diag(q_scale^2)) || N(mu_c, I))` in nats for every component, exact (method section 2)."""
+    """`KL(N(q_loc, diag(q_scale^2)) || N(mu_c, I))` in nats for every component, exact (NOLBO eq. KLexpandforlabel)."""
     excess = (q_scale.square() - 1 - 2 * torch.log(q_scale)).sum(-1, keepdim=True)
     distance = -2 * component_log_prob(q_loc, component_loc) - component_loc.shape[-1] * math.log(2 * math.pi)
     return 0.5 * (excess + distance)

@@ -91,7 +91,8 @@ class MatrixFisher(TorchDistribution):
         R_mode: the mode, a rotation.
         concentration: kappa >= 0; 0 is uniform, `1 / (2 scale^2)` a standard deviation of `scale` rad per axis.
 
-    NOLBO's p(R^f | R^z), there without its normaliser; method section 2. Mardia & Jupp, section 13.2.3.
+    NOLBO's p(R^f | R^z), there without its normaliser (eq. shapeDecoder; docs/story.md, corrections). Mardia & Jupp, section
+    13.2.3.
     """
 
     arg_constraints: ClassVar = {"R_mode": rotation_constraint, "concentration": constraints.nonnegative}

@@ -19,7 +19,7 @@ from nolbo_ppl.models.distributions.wrapped_normal import wrapped_normal_moments
 
 
 def sincos_to_angle(sincos: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    """Project (sin, cos) to the circle: the angle in rad, from which a true rotation is built (method section 2)."""
+    """Project (sin, cos) to the circle: the angle in rad, from which a true rotation is built (docs/story.md, corrections)."""
     return torch.atan2(sincos[..., 0], sincos[..., 1])
 
 

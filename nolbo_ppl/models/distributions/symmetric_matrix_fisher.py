@@ -34,7 +34,7 @@ class SymmetricMatrixFisher(TorchDistribution):
         concentration: kappa >= 0 of each element.
         order: 1 no symmetry, n n-fold, 0 free about the axis (the mean over the whole circle, in closed form).
 
-    Method section 2 (symmetry).
+    Derived in docs/story.md (symmetry).
     """
 
     arg_constraints: ClassVar = {

@@ -31,7 +31,7 @@ class ViewpointNormal(TorchDistribution):
         order: the object's symmetry about its vertical axis, None as order 1. Order n: the equal mixture over the
             azimuths `loc + 2 pi j / n`. Order 0: the azimuth is uniform.
 
-    Method sections 1 and 2; NOLBO appendix I.
+    NOLBO appendix I; docs/story.md.
     """
 
     arg_constraints: ClassVar = {
@@ -146,7 +146,7 @@ class ViewpointMixture(TorchDistribution):
         elevation_inplane_scale: their standard deviations in rad.
         max_concentration: limit of kappa, see `VonMisesMixture`.
 
-    Method section 3 (two objectives).
+    Why: docs/bound.md (the inclusive objective).
     """
 
     arg_constraints: ClassVar = {

@@ -36,7 +36,7 @@ def _gaussian_rule(p: WrappedNormal, max_concentration: float) -> tuple[Tensor, 
 def kl_wrapped_to_mixture(
     p: WrappedNormal, q: VonMisesMixture, order: Int[Tensor, "*#batch"] | int = 1
 ) -> Float[Tensor, "*batch"]:
-    """KL(p || q) in nats, the inclusive direction that trains a calibrated guide (method section 3).
+    """KL(p || q) in nats, the inclusive direction that trains a calibrated guide (docs/bound.md).
 
     Both are folded by the symmetry group of `order`: the divergence is that of the densities on the quotient, whatever
     equivalent azimuth the label names. Order 0 (free axis) gives zero. The expectation under the wrapped normal is one

@@ -36,7 +36,7 @@ def wrapped_normal_moments(loc: Float[Tensor, "*batch"], scale: Float[Tensor, "*
     """Moments of (sin, cos) of a wrapped normal angle, accurate near the axes in float32.
 
     NOLBO eq. (meanvarofwrappedgaussian), whose variances (there called sigma) lose 26 % in float32 at a scale of
-    0.03 rad where the true one is scale^4 / 2. With `u = 1 - exp(-scale^2)` nothing cancels (method section 2).
+    0.03 rad where the true one is scale^4 / 2. With `u = 1 - exp(-scale^2)` nothing cancels (docs/bound.md, corrections).
     """
     square = scale * scale
     u = -torch.expm1(-square)
@@ -158,7 +158,7 @@ def kl_of_angles(
     An upper bound of the KL of the wrapped distributions: wrapping is a map, and maps only lose information (data
     processing), whichever representative of the mean is taken before wrapping; the shortest way gives the smallest of
     these bounds. An evidence bound that uses it therefore stays a bound. It is tight for scales small beside the
-    period. Method section 2.
+    period. Why on the angle: docs/bound.md, "One error, one price".
     """
     turned = torch.remainder(loc_q - loc_p + period / 2, period) - period / 2
     ratio = scale_q / scale_p

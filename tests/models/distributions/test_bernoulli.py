@@ -61,7 +61,7 @@ def test_inclusive_kl_is_binary_cross_entropy_up_to_a_constant() -> None:
 
 
 def test_kappa_is_the_entropy_times_a_geometric_mean() -> None:
-    """kappa_o = e^H(q) (1 - eps)^q eps^(1 - q) (method section 2), in the range where that formula is safe."""
+    """kappa_o = e^H(q) (1 - eps)^q eps^(1 - q) (docs/story.md), in the range where that formula is safe."""
     logit, eps = torch.linspace(-6, 6, 25), 0.01
     q = torch.sigmoid(logit)
     entropy = -(q * q.log() + (1 - q) * (1 - q).log())

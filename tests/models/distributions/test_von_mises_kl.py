@@ -176,7 +176,7 @@ def test_gradients() -> None:
 
 
 def test_inclusive_optimum_is_calibrated() -> None:
-    """Method section 3: the best scale of the guide for errors e is sqrt(scale^2 + e^2), not the prior's."""
+    """docs/bound.md: the best scale of the guide for errors e is sqrt(scale^2 + e^2), not the prior's."""
     error = torch.tensor([-0.3, -0.1, 0.2, 0.2])
     spread = (error.square().mean() + 0.05**2).sqrt()
     kappa = torch.linspace(5.0, 60.0, 1101)
