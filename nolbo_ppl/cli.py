@@ -13,6 +13,7 @@ VERBS = {
     "demo": "a small drive, from its images to a map with a report",
     "scenes": "write a data set of generated scenes",
     "train": "train an observation model",
+    "curves": "draw the curves of a training run",
     "evaluate": "measure a model on unseen scenes",
     "observe": "posteriors of the objects in a folder of images",
     "convert": "bring real data into the formats of slam and evaluate",

@@ -156,7 +156,7 @@ for k, (axis, name) in enumerate(zip(axes, ("elevation", "in-plane rotation"))):
 # ## Position: a Gaussian in the camera frame
 #
 # The paper needs a position for SLAM and does not say where it comes from. Here a range latent gives log distance over
-# focal length, and the projected centre; together with the box they make a position whose covariance is long along the
+# pixels of a radian there, and the projected centre; together with the box they make a position whose covariance is long along the
 # ray and narrow across it. The surface is the 90 % region.
 
 # %%

@@ -53,7 +53,7 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
 @pytest.mark.parametrize("verb", VERBS)
 def test_an_unknown_option_is_refused(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        main([verb, *(["folder"] if verb in ("report", "view") else []), "--no-such-option", "1"])
+        main([verb, *(["folder"] if verb in ("curves", "report", "view") else []), "--no-such-option", "1"])
     assert stop.value.code == 2
     assert "no-such-option" in capsys.readouterr().err
 

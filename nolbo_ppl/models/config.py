@@ -72,7 +72,7 @@ class ModelConfig:
     box_scale: float = 0.05
     """Scale of the observed box about its latent, in latent units."""
     range_loc: tuple[float, float, float, float] = (-3.0, 0.0, 0.0, 0.8)
-    """Affine map of the range latent, shift: (log(range / focal length), offset of the projected centre from the box's
+    """Affine map of the range latent, shift: (log(range / pixels per radian), offset of the projected centre from the box's
     centre in box sizes, log diagonal in m)."""
     range_spread: tuple[float, float, float, float] = (1.2, 0.15, 0.15, 1.2)
     """Affine map of the range latent, factor."""
