@@ -47,6 +47,8 @@ class RunConfig:
     near objects are many times larger than far ones."""
     threshold: float = 0.3
     """Least objectness of a detection."""
+    overlap: float = 0.45
+    """Overlap (IoU) above which two regions of an image describe one object: the less certain one goes."""
     batch: int = 16
     """Images that go through the network at once."""
     depth: Path | None = None
@@ -73,6 +75,8 @@ class RunConfig:
             raise input_error("--every", got=self.every, expected="at least 1")
         if not 0 < self.threshold < 1:
             raise input_error("--threshold", got=self.threshold, expected="a probability between 0 and 1")
+        if not 0 < self.overlap <= 1:
+            raise input_error("--overlap", got=self.overlap, expected="an overlap above 0, up to 1")
         if min(self.keyframe_distance, self.keyframe_angle) < 0:
             raise input_error("spacing of keyframes", got=(self.keyframe_distance, self.keyframe_angle), expected="0 or more")
         if not self.sizes or min(self.sizes) < 32:

@@ -126,7 +126,9 @@ class Mission:
     def observe(self) -> None:
         """The guide on every keyframe."""
         config = self.config
-        options: dict[str, Any] = {"threshold": config.threshold, "decode": False, "batch": config.batch}
+        options: dict[str, Any] = {
+            "threshold": config.threshold, "iou_threshold": config.overlap, "decode": False, "batch": config.batch,
+        }  # fmt: skip
         if len(config.sizes) > 1:
             ask = partial(Pyramid(self.model, config.sizes).observe, **options)
         else:
@@ -183,7 +185,7 @@ class Mission:
 
         inputs = {name: digest(getattr(config, name)) for name in ("intrinsics", "odometry", "truth", "wheel")}
         way = of("every", "keyframe_distance", "keyframe_angle", "camera_height", "camera_pitch", "visual")
-        seen = of("sizes", "threshold", "depth", "depth_unit", "right", "baseline")
+        seen = of("sizes", "threshold", "overlap", "depth", "depth_unit", "right", "baseline")
         stages = [
             Stage("odometry", ("frames.jsonl", "intrinsics.json", "odometry.txt", "odometry_covariance.npz?", "truth.txt?"),
                   {**inputs, **way, "images": self.drive.fingerprint()}, self.odometry),
