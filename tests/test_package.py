@@ -27,7 +27,10 @@ LAYERS = (
     ("data", "viz"),
     ("inference.slam",),
     ("mission",),
-    ("scenes", "train", "evaluate", "observe", "convert", "slam", "demo", "drive", "odometry", "run", "report", "view"),
+    (
+        "scenes", "train", "curves", "evaluate", "observe", "convert", "slam", "demo", "drive", "odometry", "run", "report",
+        "view",
+    ),
     ("cli",),
 )
 """From the bottom up: a module imports from its own layer and those before it. SLAM reads the tables of `data`."""
