@@ -84,7 +84,7 @@ class TrainingData:
 
     def _open_folders(self, path: Path, size: int) -> None:
         """A user's folder, and a held-out one or its last tenth."""
-        folder = SceneFolder(path, self.model.categories, size=size)
+        folder = SceneFolder(path, self.model.categories, size=size, symmetry=self.model.symmetry)
         known = 0
         if self.config.instance_labels:
             number, _, category = folder.shapes()
@@ -93,7 +93,7 @@ class TrainingData:
                 self.model, instances=names, instance_category=tuple(int(c) for c in category)
             )
             others = tuple(name for name in folder.instances if name not in set(names))
-            folder = SceneFolder(path, self.model.categories, names + others, size=size)
+            folder = SceneFolder(path, self.model.categories, names + others, size=size, symmetry=self.model.symmetry)
             known = len(names)
         self.train = folder
         self.table = ShapeTable(*folder.shapes(), known)
@@ -103,7 +103,7 @@ class TrainingData:
             self.train, self._held_out = Part(folder, np.arange(cut)), Part(folder, np.arange(cut, len(folder)))
             self.single, self._held_out_table = self.train, self.table
         else:
-            held_out_folder = SceneFolder(self.config.validation, self.model.categories, size=size)
+            held_out_folder = SceneFolder(self.config.validation, self.model.categories, size=size, symmetry=self.model.symmetry)
             self._held_out, self._held_out_table = held_out_folder, ShapeTable(*held_out_folder.shapes())
 
     def batches(self, stage: str, start: int) -> Iterator[Any]:
