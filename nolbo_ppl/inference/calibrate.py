@@ -55,7 +55,7 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
 
     for batch in batches:
         scene = model.guide.observe(batch)
-        where, q = scene.assignment, scene.posterior
+        where, q = scene.assignment, scene.posterior.at_mode(model.story.prior.label_mean())
         add("logit", scene.encoding.objectness_logit.flatten())
         add("is_object", where.is_object.flatten())
         mask = where.assigned & (batch.visibility >= 0.5)

@@ -57,11 +57,11 @@ def _collect(model: Nolbo, scene: ObservedScene, found: dict[str, list[torch.Ten
     """Append the figures of the objects of one batch, those at least half visible."""
     batch, where, config = scene.batch, scene.assignment, model.config
     mask = where.assigned & (batch.visibility >= 0.5)
-    q = scene.posterior.map(lambda value: value[mask])
+    mean = model.story.prior.label_mean()
+    q = scene.posterior.map(lambda value: value[mask]).at_mode(mean)
     box = decode_box(q.box_loc, where.cell[mask], scene.encoding.columns, config)
     found["box50"].append(box_iou(box, batch.box[mask]) >= 0.5)
     labelled = batch.category[mask] >= 0
-    mean = model.story.prior.label_mean()
     half = config.category_dim
     distance = (q.shape_loc[:, None, :half] - mean[:, :half]).square().sum(-1)
     found["category"].append((distance.argmin(-1) == batch.category[mask])[labelled])

@@ -61,7 +61,7 @@ class Observations:
     instance_log_posterior: Float[np.ndarray, "n instances"] | None
     """Normalised log posterior of known instances ("novel" last); None for models without instance labels."""
     latent: Float[np.ndarray, "n d"]
-    """Mean of the shape latent."""
+    """Mean of the shape latent, where the likeliest category puts it."""
     latent_scale: Float[np.ndarray, "n d"]
     """Scale of the shape latent."""
     position: Float[np.ndarray, "n 3"]

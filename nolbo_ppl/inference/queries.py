@@ -183,7 +183,8 @@ class ObservationModel:
         return prepare_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
 
     def _parameters(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> RegionParameters:
-        return self.calibration.apply(self.model.guide.parameters_at(encoding, row, region))
+        q = self.model.guide.parameters_at(encoding, row, region)
+        return self.calibration.apply(q.at_mode(self._prior_mean))
 
     def _detections(
         self, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float

@@ -45,10 +45,11 @@ class RunConfig:
     sizes: tuple[int, ...] = (384,)
     """Longer sides, px, at which the model looks at each image: one for pictures like those it was trained on, more where
     near objects are many times larger than far ones."""
-    threshold: float = 0.3
+    threshold: float = 0.5
     """Least objectness of a detection."""
-    overlap: float = 0.45
-    """Overlap (IoU) above which two regions of an image describe one object: the less certain one goes."""
+    overlap: float = 0.25
+    """Overlap (IoU) above which two regions of an image describe one object: the less certain one goes. Two regions on one
+    object would be two landmarks; of two objects so close in one image another image shows the second."""
     batch: int = 16
     """Images that go through the network at once."""
     depth: Path | None = None

@@ -44,6 +44,21 @@ class RegionParameters:
     range_scale: Float[Tensor, "*n 4"]
     """Scale of the range latent."""
 
+    def at_mode(self, prior_mean: Float[Tensor, "labels d"]) -> RegionParameters:
+        """The same with the shape latent's mean where the likeliest category puts it.
+
+        The guide's one Gaussian lies between categories it hesitates about (`RegionHead.parameters_of`), where no shape is:
+        its mean there decodes to neither. Answers take the mean of the likeliest category's part; the scale, which spans
+        them all, stays.
+
+        Args:
+            prior_mean: mean latent of each category.
+        """
+        probability = torch.softmax(self.label_logits, -1)
+        likeliest = torch.nn.functional.one_hot(probability.argmax(-1), probability.shape[-1])
+        shift = (likeliest - probability) @ prior_mean.to(probability.dtype)
+        return dataclasses.replace(self, shape_loc=self.shape_loc + shift)
+
     def map(self, function) -> RegionParameters:
         """Apply a function to every tensor."""
         return RegionParameters(**{f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self)})

@@ -65,6 +65,23 @@ def test_shape_mean_is_the_expected_prior_mean_plus_a_residual() -> None:
     assert bool((prior_mean[:, 2:] == 0).all()), "the instance half of a category's mean is zero"
 
 
+def test_at_the_mode_the_likeliest_category_has_the_mean() -> None:
+    """Hesitating between two categories, the mean lies between theirs; at the mode it is one's own, residual and all."""
+    config = tiny_config()
+    model = tiny_model(config)
+    prior_mean = model.story.prior.label_mean().detach()
+    raw = torch.zeros(2, sum(model.guide.head.sizes), dtype=torch.float64)
+    raw[0, :4] = torch.tensor([0.0, 3.0, 2.8, -9.0])
+    raw[1, :4] = torch.tensor([0.0, 3.0, 3.2, -9.0])
+    residual = torch.tensor([[0.1, -0.2, 0.3, 0.4], [0.5, 0.6, -0.7, 0.8]]).double()
+    raw[:, 4:8] = residual
+    q = model.guide.head.parameters_of(raw, prior_mean)
+    mode = q.at_mode(prior_mean)
+    torch.testing.assert_close(mode.shape_loc, prior_mean[[1, 2]] + residual)
+    assert not torch.allclose(mode.shape_loc, q.shape_loc)
+    assert mode.shape_scale is q.shape_scale and mode.label_logits is q.label_logits
+
+
 def test_scales_are_positive_and_bounded_for_any_output() -> None:
     config = tiny_config()
     head = RegionHead(10, config, (6, 8), (4, 8)).double()
