@@ -73,10 +73,10 @@ PAPER: dict[str, float] = {**PURE_BOUND, "objectness": 0.0, "objectness_inclusiv
 """The paper's training loss: the bound, with the objectness KL turned round (binary cross-entropy up to a constant)."""
 
 INCLUSIVE: dict[str, float] = {
-    "objectness_inclusive": 0.5,
-    "label_inclusive": 2.0,
-    "shape_inclusive": 0.25,
-    "instance_inclusive": 0.25,
+    "objectness_inclusive": 0.8,
+    "label_inclusive": 3.0,
+    "shape_inclusive": 0.75,
+    "instance_inclusive": 0.75,
     "azimuth_inclusive": 2.5,
     "tilt_inclusive": 0.2,
     "box_inclusive": 0.3,
