@@ -138,8 +138,9 @@ class ShapeTable:
                 raise input_error("latents of mirrored shapes", got="a table taught one side", do="teach(model, mirrored=True)")
             row = row + mirrored[:, None] * len(self)
         return batch.replace(
-            shape_loc=self.loc[row], shape_scale=self.scale[row], has_voxels=batch.has_voxels & known
-        )
+            shape_loc=self.loc[row], shape_scale=self.scale[row], has_voxels=batch.has_voxels & known,
+            shape_index=torch.where(known, row, -1),
+        )  # fmt: skip
 
 
 class SceneSupply:

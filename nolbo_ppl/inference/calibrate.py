@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.optimize import minimize
 from scipy.stats import chi2
 from torch import Tensor
@@ -32,6 +32,24 @@ def region_factor(squared: Float[Tensor, " n"], dimensions: int, level: float = 
     objects that are taken for something else, and leave the region of all others too wide.
     """
     return float(torch.sqrt(torch.quantile(squared.double(), level) / chi2.ppf(level, dimensions)))
+
+
+def view_correlation(error: Float[Tensor, "n d"], group: Int[Tensor, " n"]) -> float:
+    """Correlation of whitened errors between members of a group (views of one shape); at least 0, 0 without pairs.
+
+    The intraclass correlation: the mean product over all pairs of one group, over the mean square. Errors are cut at three
+    scales, so that a few gross ones do not decide, and every group counts as its number of members less one.
+    """
+    z = error.double().clamp(-3, 3)
+    _, member, count = torch.unique(group, return_inverse=True, return_counts=True)
+    total = torch.zeros(len(count), z.shape[1], dtype=z.dtype).index_add_(0, member, z)
+    square = torch.zeros(len(count), dtype=z.dtype).index_add_(0, member, z.square().sum(1))
+    several = count > 1
+    if not bool(several.any()):
+        return 0.0
+    products = (total.square().sum(1) - square)[several] / count[several]  # pairs weighted by 1 / (n - 1) on average
+    squares = (square * (count - 1) / count)[several]
+    return float((products.sum() / squares.sum().clamp_min(1e-12)).clamp(0.0, 0.99))
 
 
 def _fit(loss, start: list[float]) -> list[float]:
@@ -75,8 +93,18 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
         add("range", ((q.range_loc - where.range_target)[ranged] / q.range_scale[ranged])[:, :3].square().sum(-1))
         if batch.shape_loc is not None:
             shaped = mask & batch.has_voxels
-            add("shape", ((q.shape_loc - batch.shape_loc)[shaped] / q.shape_scale[shaped]).square().sum(-1))
+            error = (q.shape_loc - batch.shape_loc)[shaped] / q.shape_scale[shaped]
+            add("shape", error.square().sum(-1))
+            if batch.shape_index is not None:
+                add("shape_error", error)
+                add("shape_index", batch.shape_index[shaped])
     return {name: torch.cat(values) for name, values in found.items()}
+
+
+def _shape_correlation(found: dict[str, Tensor]) -> float:
+    """Of the objects whose shape the table knows."""
+    index = found.get("shape_index", torch.zeros(0, dtype=torch.long))
+    return view_correlation(found["shape_error"][index >= 0], index[index >= 0]) if len(index) else 0.0
 
 
 def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
@@ -119,4 +147,5 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
         shape_scale=region_factor(found["shape"], model.config.latent_dim) if len(found.get("shape", ())) else 1.0,
         box_scale=region_factor(found["box"], 4),
         range_scale=region_factor(found["range"], 3) if len(found["range"]) else 1.0,
+        shape_correlation=_shape_correlation(found),
     )

@@ -19,7 +19,7 @@ from nolbo_ppl.data.trajectories import Trajectory, covariance_beside, read_traj
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.pyramid import Pyramid
 from nolbo_ppl.inference.queries import ObservationModel
-from nolbo_ppl.inference.slam import SlamProblem, SlamResult, solve, solve_online
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online
 from nolbo_ppl.inference.slam.export import library_versions, write_result
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import atomic_path, read_json, read_jsonl, write_json, write_jsonl
@@ -62,6 +62,13 @@ class Mission:
     def model(self) -> ObservationModel:
         """The observation model."""
         return load(self.config.model)
+
+    @cached_property
+    def slam_config(self) -> SlamConfig:
+        """Settings of the EM, with what the model knows of its own views."""
+        if self.config.slam.latent_correlation is not None:
+            return self.config.slam
+        return dataclasses.replace(self.config.slam, latent_correlation=self.model.calibration.shape_correlation)
 
     @cached_property
     def keyframes(self) -> np.ndarray:
@@ -139,7 +146,7 @@ class Mission:
     def slam(self) -> None:
         """EM: trajectory, landmarks, associations, decoded shapes, where every iteration stood."""
         config, problem = self.config, self.problem
-        result: SlamResult = solve_online(problem, config.slam) if config.online else solve(problem, config.slam)
+        result: SlamResult = (solve_online if config.online else solve)(problem, self.slam_config)
         write_noise(self.out / "slam" / "noise.npz", result.state.noise)
         write_result(self.out / "slam", result, Trajectory(problem.odometry), self.truth, model=self.model)
 
@@ -162,7 +169,7 @@ class Mission:
         config = self.config
         summary, objects = summarise(
             self.out, self.seconds, self.cpu_seconds, self.problem, drive=config.truth_objects,
-            model=None if config.truth_objects is None else self.model, config=config.slam, loop_gap=config.loop_gap,
+            model=None if config.truth_objects is None else self.model, config=self.slam_config, loop_gap=config.loop_gap,
             seed=config.seed,
         )  # fmt: skip
         if objects is not None:

@@ -33,10 +33,16 @@ class Calibration:
     """Factor of the scale of the box latent."""
     range_scale: float = 1.0
     """Factor of the scale of the range latent."""
+    shape_correlation: float = 0.0
+    """Correlation of the shape latent's errors in two views of one object: what many views together can tell."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.shape_correlation < 1:
+            raise input_error("shape_correlation", got=self.shape_correlation, expected="a correlation from 0 to below 1")
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
+            if field.name == "shape_correlation":
+                continue
             if not (isinstance(value, (int, float)) and abs(value) < 1e6) or (
                 field.name != "objectness_shift" and value <= 0
             ):

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference import calibrate as module
-from nolbo_ppl.inference.calibrate import calibrate, region_factor
+from nolbo_ppl.inference.calibrate import calibrate, region_factor, view_correlation
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.guide import Guide, ObservedScene
 from nolbo_ppl.models.scene import SceneBatch
@@ -24,6 +24,22 @@ def test_region_factor_makes_the_region_cover() -> None:
     assert factor == pytest.approx(1.7, rel=0.02)
     inside = (error / factor).square().sum(-1) <= chi2.ppf(0.9, 3)
     assert float(inside.double().mean()) == pytest.approx(0.9, abs=1e-3)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.35, 0.8])
+def test_correlation_of_views_is_found(correlation: float) -> None:
+    """Errors with a part common to the views of a shape: its share of the variance comes back."""
+    g = torch.Generator().manual_seed(3)
+    group = torch.randint(0, 900, (4000,), generator=g)
+    common = torch.randn(900, 6, generator=g)[group]
+    own = torch.randn(4000, 6, generator=g)
+    found = view_correlation(math.sqrt(correlation) * common + math.sqrt(1 - correlation) * own, group)
+    assert found == pytest.approx(correlation, abs=0.03)
+
+
+def test_views_without_partners_have_no_correlation() -> None:
+    assert view_correlation(torch.randn(50, 3), torch.arange(50)) == 0.0
+    assert view_correlation(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)) == 0.0
 
 
 def test_distorted_scales_and_odds_are_found(monkeypatch: pytest.MonkeyPatch) -> None:

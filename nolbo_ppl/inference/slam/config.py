@@ -33,6 +33,9 @@ class SlamConfig:
     """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
     latent_scale: float | None = None
     """Standard deviation of a latent coordinate, for observations that state none."""
+    latent_correlation: float | None = None
+    """Correlation of the latent's errors in two detections of one object. None: 0, and in a run from images what the model's
+    calibration says. Without it many views of one side would pass for certainty about the whole shape."""
     new_rate: float | None = None
     """Density of landmarks not seen before, per m^3 of the observed space."""
     clutter_rate: float | None = None
@@ -79,6 +82,10 @@ class SlamConfig:
     """Seed of the posterior samples."""
     associator: Associator = "exact"
     """How association marginals are computed (see `nolbo_ppl.inference.association`)."""
+
+    def __post_init__(self) -> None:
+        if self.latent_correlation is not None and not 0 <= self.latent_correlation < 1:
+            raise input_error("latent_correlation", got=self.latent_correlation, expected="a correlation from 0 to below 1")
 
 
 def check_step_covariance(covariance: np.ndarray, steps: int) -> None:

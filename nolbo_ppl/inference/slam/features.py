@@ -103,6 +103,14 @@ def fuse_latent(
     return variance * (mean_a / variance_a + mean_b / variance_b), variance
 
 
+def correlated_variance(
+    variance: Float[np.ndarray, "g d"], count: Float[np.ndarray, " g"], correlation: float
+) -> Float[np.ndarray, "g d"]:
+    """Variance of a mean whose parts are correlated: `(1 + r (n - 1))` times that of independent parts; missing ones stay."""
+    factor = 1.0 + correlation * np.maximum(count - 1.0, 0.0)
+    return np.where(variance < LARGE_VARIANCE, variance * factor[:, None], variance)
+
+
 def weighted_latents(
     latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, " n"],
     weight: Float[np.ndarray, " n"], groups: int,

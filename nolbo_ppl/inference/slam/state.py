@@ -12,7 +12,13 @@ from nolbo_ppl.geometry.pose import inverse, make_pose, transform
 from nolbo_ppl.inference.slam.calibration import calibrate
 from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.evidence import TrackletFeatures, log_population
-from nolbo_ppl.inference.slam.features import FeaturePrior, detection_features, fit_prior, weighted_latents
+from nolbo_ppl.inference.slam.features import (
+    FeaturePrior,
+    correlated_variance,
+    detection_features,
+    fit_prior,
+    weighted_latents,
+)
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import (
     Estimate,
@@ -105,6 +111,8 @@ def tracklet_features(
     table = problem.observations
     latent, variance, category = detection_features(table, noise, prior)
     mean, spread = weighted_latents(latent[rows], variance[rows], landmark, weight, landmarks)
+    views = np.bincount(landmark, weights=weight * table.has_latent[rows], minlength=landmarks)
+    spread = correlated_variance(spread, views, config.latent_correlation or 0.0)
     votes = np.zeros((landmarks, len(prior.categories) + 1))
     named = category[rows] >= 0
     np.add.at(votes, (landmark[named], category[rows][named]), weight[named])
