@@ -155,7 +155,8 @@ def training_config(name: str, settings: Settings) -> AblationConfig:
         out=settings.out / name / "run", preset=settings.preset, difficulty=settings.difficulty, count=settings.count,
         single_count=settings.single_count, cache=settings.cache, seed=settings.seed, shape_steps=shapes,
         single_steps=single, scene_steps=scenes, batch=settings.batch, threads=settings.threads, workers=settings.workers,
-        networks={"image_size": settings.image_size, **variant.networks}, scenes=named_instances(settings) if variant.folder else None,
+        networks={"image_size": settings.image_size, **variant.networks},
+        scenes=named_instances(settings) if variant.folder else None,
     )  # fmt: skip
     return replace(config, **variant.training)
 

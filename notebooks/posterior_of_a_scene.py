@@ -156,8 +156,8 @@ for k, (axis, name) in enumerate(zip(axes, ("elevation", "in-plane rotation"))):
 # ## Position: a Gaussian in the camera frame
 #
 # The paper needs a position for SLAM and does not say where it comes from. Here a range latent gives log distance over
-# pixels of a radian there, and the projected centre; together with the box they make a position whose covariance is long along the
-# ray and narrow across it. The surface is the 90 % region.
+# pixels of a radian there, and the projected centre; together with the box they make a position whose covariance is long
+# along the ray and narrow across it. The surface is the 90 % region.
 
 # %%
 mean, covariance = objects.position[index], objects.position_covariance[index]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from nolbo_ppl.geometry.pose import inverse, make_pose, matrix_to_quaternion, tr
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import pack_voxels, voxel_centres
 from nolbo_ppl.inference.observations import Observations, ViewpointModes
+from nolbo_ppl.models.calibration import Calibration
 
 CAMERA = np.array([100.0, 100.0, 96.0, 48.0])
 SIZE = (192, 96)
@@ -48,6 +49,7 @@ class KnowingModel:
     table: ObservationTable
     latents: np.ndarray
     calls: int = 0
+    calibration: Calibration = field(default_factory=Calibration)
 
     def observe(self, images: Any, intrinsics: Any = None, **options: Any) -> list[Observations]:
         self.calls += 1
