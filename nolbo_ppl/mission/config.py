@@ -42,12 +42,12 @@ class RunConfig:
     """Of those, keep one this far from the last, m; with `keyframe_angle` 0 as well, all are kept."""
     keyframe_angle: float = 0.0
     """Or turned by this much, rad."""
-    sizes: tuple[int, ...] = (384,)
+    sizes: tuple[int, ...] = (576,)
     """Longer sides, px, at which the model looks at each image: one for pictures like those it was trained on, more where
     near objects are many times larger than far ones."""
-    threshold: float = 0.5
+    threshold: float = 0.6
     """Least objectness of a detection."""
-    overlap: float = 0.25
+    overlap: float = 0.2
     """Overlap (IoU) above which two regions of an image describe one object: the less certain one goes. Two regions on one
     object would be two landmarks; of two objects so close in one image another image shows the second."""
     batch: int = 16
