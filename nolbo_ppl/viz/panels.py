@@ -147,7 +147,7 @@ def draw_range(axes: Axes, observations: Observations) -> None:
         axes.set(xlim=(-reach, reach), ylim=(low[2] / 1.35, high[3] * 1.45))
         _number_and_heading(axes, observations)
     axes.set(xlabel="bearing, degrees (right positive)", ylabel="distance, m")
-    axes.set_title("positions with 90 % regions; arrows: fronts seen from above")
+    axes.set_title("positions, 90 % regions, fronts, from above")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if str(f"{value:e}")[0] in "25" else "")
     axes.tick_params(axis="y", which="minor", labelsize=6.5)
