@@ -14,12 +14,13 @@ LINK = re.compile(r"\[([^\]\n]*)\]\(([^)\s]+?)(#[^)\s]*)?\)")
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Point links at notebooks to their pages; other files of the repository are named, not linked."""
     folder = Path(page.file.src_uri).parent
+    source = ROOT / "notebooks" if folder == Path("tutorials") else ROOT / "docs" / folder  # where the text was written
 
     def rewrite(match: re.Match[str]) -> str:
         text, target, anchor = match[1], match[2], match[3] or ""
         if "://" in target or target.startswith("#"):
             return match[0]
-        path = Path(os.path.normpath(ROOT / "docs" / folder / target))
+        path = Path(os.path.normpath(source / target))
         if path.is_relative_to(ROOT / "docs") or not path.exists():
             return match[0]
         path = path.relative_to(ROOT)
