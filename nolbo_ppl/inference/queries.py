@@ -186,6 +186,13 @@ class ObservationModel:
         q = self.model.guide.parameters_at(encoding, row, region)
         return self.calibration.apply(q.at_mode(self._prior_mean))
 
+    def _boxes(
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]
+    ) -> Float[Tensor, "n 4"]:
+        """Boxes of regions, px of the scaled image; no second look is needed for them."""
+        q = self.model.guide.parameters_at(encoding, row, region, look=False)
+        return decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
+
     def _detections(
         self, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float
     ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"]]:
@@ -198,8 +205,7 @@ class ObservationModel:
         row, region = (logit > math.log(least / (1 - least))).nonzero(as_tuple=True)
         if len(region) == 0:
             return row, region, logit.new_empty(0)
-        q = self._parameters(encoding, row, region)
-        box = decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
+        box = self._boxes(encoding, row, region)
         kept, stands_for = suppress(box, logit[row, region], iou_threshold, group=row)
         probability = torch.zeros(len(row), dtype=torch.float64)
         probability.index_add_(0, stands_for, torch.sigmoid(logit[row, region].double()))
@@ -215,8 +221,7 @@ class ObservationModel:
         p, columns = self.config.predictors, encoding.columns
         cell = cell_of(box, encoding.rows, columns, self.config.stride)
         region = (cell[:, None] * p + torch.arange(p)).flatten()
-        q = self._parameters(encoding, row.repeat_interleave(p), region)
-        own = decode_box(q.box_loc, region // p, columns, self.config).unflatten(0, (-1, p))
+        own = self._boxes(encoding, row.repeat_interleave(p), region).unflatten(0, (-1, p))
         return cell * p + box_iou(own, box[:, None]).argmax(-1)
 
     @cached_property

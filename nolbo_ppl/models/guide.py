@@ -98,7 +98,7 @@ class Guide(nn.Module):
         return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine)
 
     def parameters_at(
-        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], look: bool = True
     ) -> RegionParameters:
         """Posterior parameters of given regions.
 
@@ -106,13 +106,14 @@ class Guide(nn.Module):
             encoding: the encoded images.
             row: the image of each region.
             region: its number, cell * predictors + predictor.
+            look: take the second look at each region's box. Boxes are the same without it, and soon found.
         """
         cell, predictor = region // self.config.predictors, region % self.config.predictors
         with self._autocast():
             raw = self.head(encoding.features[row, cell])[torch.arange(len(row)), predictor]
-            raw = self.head.refine(
-                raw.to(self.head.objectness.weight.dtype), encoding.fine, row, cell, encoding.columns
-            )
+            raw = raw.to(self.head.objectness.weight.dtype)
+            if look:
+                raw = self.head.refine(raw, encoding.fine, row, cell, encoding.columns)
         return self.head.parameters_of(raw, self._prior().label_mean())
 
     def _raw(self, encoding: Encoding, cell: Int[Tensor, "b m"]) -> Float[Tensor, "b m predictors outputs"]:
