@@ -19,7 +19,7 @@ def mirror_voxels(packed: UInt8[Tensor, "*n bytes"]) -> UInt8[Tensor, "*n bytes"
     """Packed grids reflected along their first axis, the object's x.
 
     Raises:
-        InputError: the bytes are not those of a grid whose layers fill whole bytes (8^3, 32^3, 64^3, ...).
+        InputError: the bytes are not those of a grid whose layers fill whole bytes (4^3, 8^3, 32^3, ...).
     """
     size = round((8 * packed.shape[-1]) ** (1 / 3))
     if size**3 != 8 * packed.shape[-1] or size * size % 8:

@@ -78,7 +78,7 @@ def assemble(
         latent=q.shape_loc.numpy(),
         latent_scale=q.shape_scale.numpy(),
         position=position.double().numpy(),
-        position_covariance=position_covariance(q, box, box_scale, position, camera, config).double().numpy(),
+        position_covariance=position_covariance(q, box, box_scale, position, camera, config).numpy(),
         viewpoint_modes=ViewpointModes(azimuth.weights.numpy(), azimuth.component_mean.numpy(), azimuth.concentration.numpy()),
         elevation_inplane=q.angle_loc.numpy(),
         elevation_inplane_scale=q.angle_scale.numpy(),
@@ -115,7 +115,7 @@ def position_covariance(
     q: RegionParameters, box: Float[Tensor, "n 4"], box_scale: Float[Tensor, "n 4"], position: Float[Tensor, "n 3"],
     camera: Float[Tensor, "n 4"], config: ModelConfig,
 ) -> Float[Tensor, "n 3 3"]:
-    """Covariance of the position, m^2, to first order: along the ray from the range, across it from the centre's pixel.
+    """Covariance of the position, m^2, float64, to first order: along the ray from the range, across it from the centre's pixel.
 
     With slopes s = (x, y) / z and n^2 = 1 + |s|^2 the position is e^r f n^(1/2) (s, 1) (`decode_range`): a pixel turns
     the ray, and changes the range a little, for off the axis a radian covers more pixels.
@@ -128,7 +128,8 @@ def position_covariance(
         camera: [fx, fy, cx, cy], px.
         config: configuration of the networks.
     """
-    unit, loc = (q.range_loc.new_tensor(v) for v in (config.range_spread, config.range_loc))
+    box, box_scale, position, camera = (value.double() for value in (box, box_scale, position, camera))
+    unit, loc = (position.new_tensor(v) for v in (config.range_spread, config.range_loc))
     spread, offset = q.range_scale * unit, q.range_loc * unit + loc
     extent = box[:, 2:] - box[:, :2]
     # the centre's pixel = the box's centre + offset * extent: three independent errors an axis

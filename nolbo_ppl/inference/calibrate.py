@@ -37,8 +37,8 @@ def region_factor(squared: Float[Tensor, " n"], dimensions: int, level: float = 
 def view_correlation(error: Float[Tensor, "n d"], group: Int[Tensor, " n"]) -> float:
     """Correlation of whitened errors between members of a group (views of one shape); at least 0, 0 without pairs.
 
-    The intraclass correlation: the mean product over all pairs of one group, over the mean square. Errors are cut at three
-    scales, so that a few gross ones do not decide, and every group counts as its number of members less one.
+    Fisher's intraclass correlation about a mean of zero: products of all pairs of a group over mean squares. Errors are cut at
+    three scales, so that a few gross ones do not decide; a group of n views counts n - 1 times.
     """
     z = error.double().clamp(-3, 3)
     _, member, count = torch.unique(group, return_inverse=True, return_counts=True)
@@ -47,7 +47,7 @@ def view_correlation(error: Float[Tensor, "n d"], group: Int[Tensor, " n"]) -> f
     several = count > 1
     if not bool(several.any()):
         return 0.0
-    products = (total.square().sum(1) - square)[several] / count[several]  # pairs weighted by 1 / (n - 1) on average
+    products = (total.square().sum(1) - square)[several] / count[several]
     squares = (square * (count - 1) / count)[several]
     return float((products.sum() / squares.sum().clamp_min(1e-12)).clamp(0.0, 0.99))
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.boxes import box_iou
+from nolbo_ppl.geometry.boxes import pairwise_iou
 from nolbo_ppl.metrics.detection import match_image
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def object_shown(
     for t, seen in enumerate(truth.frames):
         rows = np.flatnonzero(frame == t)
         if len(rows) and len(seen.object):
-            overlap = box_iou(torch.from_numpy(box[rows])[:, None], torch.from_numpy(seen.box)[None]).numpy()
+            overlap = pairwise_iou(torch.from_numpy(box[rows]), torch.from_numpy(seen.box)).numpy()
             best = overlap.argmax(1)
             shown[rows] = np.where(overlap.max(1) >= least_overlap, seen.object[best], -1)
     return shown

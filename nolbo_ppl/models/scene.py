@@ -161,7 +161,8 @@ def focal_length(intrinsics: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
 def pixels_per_radian(ray: Float[Tensor, "*n 3"], intrinsics: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n"]:
     """How many pixels a radian covers along a ray of the camera, of any length; geometric mean over its two directions.
 
-    A pinhole camera draws what lies off its axis larger: by 1 / cos of the angle across, by 1 / cos^2 away from the middle.
+    A pinhole camera draws what lies off its axis larger: by 1 / cos of the angle across, by 1 / cos^2 away from the middle
+    (docs/story.md; the test takes the area of a small cone's picture).
     """
     cosine = ray[..., 2] / torch.linalg.vector_norm(ray, dim=-1)
     return focal_length(intrinsics) * cosine.clamp_min(1e-3) ** -1.5

@@ -106,7 +106,8 @@ def fuse_latent(
 def correlated_variance(
     variance: Float[np.ndarray, "g d"], count: Float[np.ndarray, " g"], correlation: float
 ) -> Float[np.ndarray, "g d"]:
-    """Variance of a mean whose parts are correlated: `(1 + r (n - 1))` times that of independent parts; missing ones stay."""
+    """Variance of a mean of n parts with correlation r: `(1 + r (n - 1))` times that of independent parts (docs/slam.md, the
+    latent update); missing ones stay."""
     factor = 1.0 + correlation * np.maximum(count - 1.0, 0.0)
     return np.where(variance < LARGE_VARIANCE, variance * factor[:, None], variance)
 
