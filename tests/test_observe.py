@@ -73,7 +73,8 @@ def test_lines_say_what_the_query_says(observed: Path, model: Path, images: Path
     for i, row in enumerate(rows):
         assert row["category"] == answer.category[i]
         np.testing.assert_allclose(row["position"], answer.position[i], atol=1e-5)
-        np.testing.assert_allclose(row["position_cov"], answer.position_covariance[i], atol=1e-8, rtol=1e-5)  # a float32 network: a batch sums in another order
+        # A float32 network: a batch sums in another order than one image.
+        np.testing.assert_allclose(row["position_cov"], answer.position_covariance[i], atol=1e-8, rtol=1e-5)
         np.testing.assert_allclose(row["latent"], answer.latent[i], atol=1e-5)
         assert sum(row["class_posterior"].values()) == pytest.approx(1, abs=1e-5)
         assert sum(mode["weight"] for mode in row["azimuth_modes"]) == pytest.approx(1, abs=1e-4)
