@@ -76,7 +76,7 @@ def run(config: TrainConfig) -> TrainSummary:
             continue
         if stage.name != "shapes":
             data.teach(model)
-        stage_run = StageRun(model, stage, config.bf16)
+        stage_run = StageRun(model, stage, config.bf16, config.average_every)
         if number == first and tensors is not None:
             optimisation.restore(stage_run.state, tensors, at_step)
         w, b = _train_stage(stage_run, number, data, journal, config)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from datetime import timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -17,6 +18,10 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
+
+if TYPE_CHECKING:
+    from nolbo_ppl.inference.stages import StageRun
+    from nolbo_ppl.models.scene import SceneBatch
 
 
 def part_of(rows: Tensor, rank: int | None, first: int) -> Tensor:
@@ -54,7 +59,6 @@ def training(rank: int | None) -> dict[str, Tensor]:
     """State after steps of shapes, then of scenes: frozen, then free and decoding."""
     from nolbo_ppl.inference.optimisation import OptimisationConfig
     from nolbo_ppl.inference.stages import Stage, StageRun, scene_weights
-    from nolbo_ppl.models.scene import SceneBatch
     from nolbo_ppl.models.shape_vae import ShapeBatch
     from tests.factories import random_batch, tiny_config, tiny_model
 
@@ -86,7 +90,37 @@ def training(rank: int | None) -> dict[str, Tensor]:
     return {**state, **{f"average/{name}": value for name, value in scenes.state.average.items()}}
 
 
-TASKS = {"normalisation": normalisation, "training": training}
+def local_run(seed: int) -> StageRun:
+    """Scenes, three steps in all, averaged after every second one."""
+    from nolbo_ppl.inference.optimisation import OptimisationConfig
+    from nolbo_ppl.inference.stages import Stage, StageRun, scene_weights
+    from tests.factories import tiny_model
+
+    quick = OptimisationConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
+    stage = Stage("scenes", quick, scene_weights("inclusive"), freeze=3)
+    return StageRun(tiny_model(scatter=0.1, seed=seed), stage, average_every=2)
+
+
+def local_batch(rank: int, step: int) -> SceneBatch:
+    """What one process sees in a step."""
+    from tests.factories import random_batch, tiny_config
+
+    return random_batch(tiny_config(), scenes=2, slots=3, objects=3, seed=10 * rank + step)
+
+
+def local(rank: int) -> dict[str, Tensor]:
+    """State of steps made alone, after the average of two and after the last average."""
+    from nolbo_ppl.inference.optimisation import state_tensors
+
+    run, tensors = local_run(0), {}
+    for step in range(3):
+        run.step(local_batch(rank, step))
+        if step:
+            tensors |= {f"{step}/{name}": value for name, value in state_tensors(run.state).items()}
+    return tensors
+
+
+TASKS = {"normalisation": normalisation, "training": training, "local": local}
 
 
 def main() -> None:

@@ -471,10 +471,13 @@ main(sys.argv[1:])
 
 @pytest.mark.slow
 def test_two_processes_learn_what_one_does_with_the_joint_batch(folders: tuple[Path, Path], tmp_path: Path) -> None:
-    """In double precision, and without the augmentation's float32: Adam turns rounding of small gradients into steps."""
+    """In double precision, and without the augmentation's float32: Adam turns rounding of small gradients into steps.
+
+    With AdamW, for Muon's iteration is in bfloat16 whatever the weights are.
+    """
     script = tmp_path / "train.py"
     script.write_text(DOUBLE_PRECISION, encoding="utf-8")
-    shared: dict[str, Any] = {"weights": {"voxels": 1e-3}, "decode": 100, "freeze": 0.5, "augment": False}
+    shared: dict[str, Any] = {"weights": {"voxels": 1e-3}, "decode": 100, "freeze": 0.5, "augment": False, "optimizer": "adamw"}
     one, two = (config_of(folders, tmp_path / name, **shared) for name in ("one", "two"))
     several = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     for start, config in (([], one), (several, two)):

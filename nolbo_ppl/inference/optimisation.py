@@ -10,14 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
+import torch.distributed as distributed
 from torch import Tensor, nn
 
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.inference.checkpoint import optimizer_tensors, restore_optimizer
 from nolbo_ppl.inference.elbo import ElboResult
+from nolbo_ppl.inference.muon import MuonAdamW
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,10 @@ class OptimisationConfig:
     """Largest gradient norm; larger gradients are scaled down."""
     ema: float = 0.998
     """Decay of the moving average of the weights."""
+    optimizer: Literal["muon", "adamw"] = "adamw"
+    """AdamW, or Muon on hidden kernels and matrices with AdamW on all else (`nolbo_ppl.inference.muon`)."""
+    pace: float = 4.0
+    """Rate of Muon's matrices over `learning_rate`."""
 
 
 @dataclass
@@ -83,15 +89,21 @@ def learning_rate(config: OptimisationConfig, step: int) -> float:
 
 
 def init(module: nn.Module, loss: Callable[..., ElboResult], config: OptimisationConfig) -> OptimisationState:
-    """State before the first step: AdamW over the parameters that require a gradient."""
-    trainable = {name: p for name, p in module.named_parameters() if p.requires_grad}
-    groups = [
-        {"params": [p for p in trainable.values() if p.dim() > 1], "weight_decay": config.weight_decay},
-        {"params": [p for p in trainable.values() if p.dim() <= 1], "weight_decay": 0.0},
-    ]
-    optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
+    """State before the first step: the optimiser over the parameters that require a gradient."""
     average = {name: value.detach().clone() for name, value in module.state_dict().items()}
-    return OptimisationState(module, loss, optimizer, config, average)
+    return OptimisationState(module, loss, make_optimizer(module, config), config, average)
+
+
+def make_optimizer(module: nn.Module, config: OptimisationConfig) -> torch.optim.Optimizer:
+    """The optimiser a configuration names, over the parameters that require a gradient."""
+    if config.optimizer == "muon":
+        return MuonAdamW(module, config.learning_rate, config.weight_decay, config.pace)
+    trainable = [p for p in module.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in trainable if p.dim() > 1], "weight_decay": config.weight_decay},
+        {"params": [p for p in trainable if p.dim() <= 1], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
 
 
 def step(state: OptimisationState, *args: Any, **kwargs: Any) -> tuple[OptimisationState, StepInfo]:
@@ -132,6 +144,19 @@ def _update_average(state: OptimisationState) -> None:
     for name, value in state.average.items():
         if not value.is_floating_point():
             value.copy_(current[name])
+
+
+@torch.no_grad()
+def average_over_processes(state: OptimisationState) -> None:
+    """Give every process the mean of all: weights, normalisation's statistics, moving average, optimiser's state."""
+    moments = [value for of in state.optimizer.state.values() for value in of.values()]
+    tensors = [*state.module.state_dict().values(), *state.average.values(), *moments]
+    floating = [value for value in tensors if torch.is_tensor(value) and value.is_floating_point()]
+    together = torch.cat([value.detach().flatten() for value in floating])
+    distributed.all_reduce(together)
+    together /= distributed.get_world_size()
+    for value, mean in zip(floating, together.split([value.numel() for value in floating])):
+        value.copy_(mean.view_as(value))
 
 
 def state_tensors(state: OptimisationState) -> dict[str, Tensor]:

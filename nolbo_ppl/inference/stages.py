@@ -14,6 +14,7 @@ from nolbo_ppl.inference import optimisation
 from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, ElboResult, SceneElbo, SceneLoss
 from nolbo_ppl.inference.optimisation import OptimisationConfig, OptimisationState
 from nolbo_ppl.models.nolbo import Nolbo
+from nolbo_ppl.models.normalisation import set_joint
 from nolbo_ppl.models.scene import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
 
@@ -56,10 +57,13 @@ class StageRun:
         model: the networks.
         stage: what to do with them.
         half_precision: networks in bfloat16.
+        average_every: with several processes, the steps each makes by itself on its share of the batches before weights,
+            moving averages and the optimiser's state are averaged over all (local SGD; Stich, 2019). At 1 they share
+            every step: gradients and statistics of the joint batch, which costs far more exchange.
     """
 
-    def __init__(self, model: Nolbo, stage: Stage, half_precision: bool = False) -> None:
-        self.model, self.stage = model, stage
+    def __init__(self, model: Nolbo, stage: Stage, half_precision: bool = False, average_every: int = 1) -> None:
+        self.model, self.stage, self.average_every = model, stage, average_every
         self._frozen: bool | None = None
         model.requires_grad_(True)
         model.set_half_precision(half_precision)
@@ -71,7 +75,10 @@ class StageRun:
             if stage.freeze >= stage.optimisation.steps:
                 model.story.requires_grad_(False)
             module = SceneLoss(model.story, model.guide, SceneElbo(stage.weights))
-        if distributed.is_available() and distributed.is_initialized():
+        together = distributed.is_available() and distributed.is_initialized()
+        self._local = together and average_every > 1
+        set_joint(model, not self._local)
+        if together and not self._local:
             module = DistributedDataParallel(module, find_unused_parameters=True)
         self.state: OptimisationState = optimisation.init(model, module, stage.optimisation)
 
@@ -93,6 +100,8 @@ class StageRun:
         self.set_modes()
         arguments = {} if self.stage.name == "shapes" else {"decode": self.stage.decode}
         self.state, info = optimisation.step(self.state, batch, **arguments)
+        if self._local and (self.finished or self.state.step % self.average_every == 0):
+            optimisation.average_over_processes(self.state)
         return info
 
     @property

@@ -81,12 +81,17 @@ class TrainConfig:
     """Objects decoded a step where the objective has voxels; their term stands for all objects."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of single terms (names: `nolbo_ppl.inference.elbo`) in place of the objective's own, as `voxels 0.002`."""
+    average_every: int = 1
+    """With several processes (`torchrun`): steps that each makes by itself before their weights are averaged; at 1 they
+    share every step, as one process with the joint batch would make it."""
     batch: int = 64
     """Scenes a step, over all processes."""
     shape_batch: int = 32
     """Shapes a step."""
     learning_rate: float = 2.5e-3
     """Rate of the stages on images after their warm-up."""
+    optimizer: Literal["muon", "adamw"] = "muon"
+    """Optimiser of the stages on images; shapes are learnt by AdamW."""
     sizes: tuple[int, ...] = ()
     """Image sides to choose from each step, multiples of 32; empty for the preset's own."""
     augment: bool = True
@@ -114,9 +119,17 @@ class TrainConfig:
     """Go on from the run's checkpoint where there is one; otherwise a folder with a checkpoint is refused."""
 
     def __post_init__(self) -> None:
-        for name in ("batch", "shape_batch", "log_every", "evaluate_every", "checkpoint_every", "count", "workers"):
+        at_least_one = (
+            "batch", "shape_batch", "log_every", "evaluate_every", "checkpoint_every", "count", "workers", "average_every"
+        )  # fmt: skip
+        for name in at_least_one:
             if getattr(self, name) < 1:
                 raise input_error(name, got=getattr(self, name), expected="at least 1")
+        if self.checkpoint_every % self.average_every:
+            raise input_error(
+                "checkpoint_every", got=self.checkpoint_every, expected=f"a multiple of average_every, {self.average_every}",
+                do="a run goes on exactly only from where the weights of all processes were averaged",
+            )
         if not 0 <= self.freeze <= 1:
             raise input_error("freeze", got=self.freeze, expected="a share from 0 to 1")
         if any(size % 32 or size <= 0 for size in self.sizes):
@@ -170,7 +183,7 @@ class TrainConfig:
     def stages(self) -> list[Stage]:
         """The stages that have steps."""
         weights = scene_weights(self.objective, self.weights)
-        images = OptimisationConfig(learning_rate=self.learning_rate)
+        images = OptimisationConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
         stages = [
             Stage(
                 "shapes",

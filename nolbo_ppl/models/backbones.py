@@ -67,14 +67,14 @@ class TinyEncoder(nn.Module):
         self.deep = nn.Sequential(ConvUnit(c8, c16, 3, 2), *(ResidualBlock(c16) for _ in range(n16)))
         self.fold = nn.PixelUnshuffle(2)
         self.channels = c16 + 4 * c8
-        self.fine_channels, self.fine_strides = (c4, c8), (4, 8)
+        self.fine_channels, self.fine_strides = (c4, c8, c16), (4, 8, 16)
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b c gh gw"], tuple[Tensor, ...]]:
-        """Features of each 16 x 16 px cell, and the maps of strides 4 and 8."""
+        """Features of each 16 x 16 px cell, and the maps of strides 4, 8 and 16."""
         fine = self.stem(image)
         middle = self.middle(fine)
         deep = self.deep(middle)
-        return torch.cat((deep, self.fold(middle)), dim=1), (fine, middle)
+        return torch.cat((deep, self.fold(middle)), dim=1), (fine, middle, deep)
 
 
 _DARKNET19: tuple[tuple[tuple[int, int], ...], ...] = (

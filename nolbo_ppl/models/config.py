@@ -35,6 +35,12 @@ class ModelConfig:
     (darknet19, whose head is the paper's, has none)."""
     glimpse_width: int = 96
     """Channels of the second look, a multiple of 4."""
+    glimpse_maps: int = 2
+    """Maps of the encoder that the second look samples, from the finest on: strides 4, 8, 16."""
+    glimpse_blocks: int = 0
+    """Residual blocks of the second look."""
+    glimpse_detail: bool = False
+    """The second look samples the finest map twice as densely too."""
     predictors: int = 2
     """Predictors P of each cell; a scene of G x G cells has K = G G P regions."""
     image_size: int = 128
@@ -107,6 +113,11 @@ class ModelConfig:
             raise input_error(
                 "second look", got=f"glimpse={self.glimpse}, glimpse_width={self.glimpse_width}",
                 expected="glimpse >= 0 and glimpse_width a positive multiple of 4",
+            )
+        if not 1 <= self.glimpse_maps <= 3 or self.glimpse_blocks < 0:
+            raise input_error(
+                "second look", got=f"glimpse_maps={self.glimpse_maps}, glimpse_blocks={self.glimpse_blocks}",
+                expected="1 to 3 maps, blocks >= 0",
             )
         if self.image_size % 32 or self.image_size <= 0:
             raise input_error("image_size", got=self.image_size, expected="a positive multiple of 32")

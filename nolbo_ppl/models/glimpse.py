@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.layers import OutputLinear
 
 MARGIN = 1.2
 """The grid covers the box enlarged by this factor, so that its surroundings are seen too."""
@@ -59,25 +60,45 @@ def sample_map(
     return torch.lerp(upper, lower, fy.to(table.dtype))
 
 
+class GlimpseBlock(nn.Module):
+    """Two 3 x 3 convolutions beside the identity, which they are at the start of training."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        last = nn.GroupNorm(4, width)
+        nn.init.zeros_(last.weight)
+        self.branch = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1, bias=False), nn.GroupNorm(4, width), nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1, bias=False), last,
+        )  # fmt: skip
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        """Add the two convolutions to the input."""
+        return x + self.branch(x)
+
+
 class Glimpse(nn.Module):
     """Features sampled over a box -> what is added to the cell's raw outputs; little at the start of training.
 
     Args:
-        channels: channels of the sampled maps together.
+        channels: channels of each of the encoder's maps, finest first.
         strides: their strides, px.
         outputs: numbers to add.
-        config: sizes.
+        config: sizes; `glimpse_maps` of the maps are sampled, and with `glimpse_detail` the finest one twice as densely
+            too, for details that the grid steps over.
     """
 
-    def __init__(self, channels: int, strides: Sequence[int], outputs: int, config: ModelConfig) -> None:
+    def __init__(self, channels: Sequence[int], strides: Sequence[int], outputs: int, config: ModelConfig) -> None:
         super().__init__()
-        self.side, self.strides = config.glimpse, tuple(strides)
+        self.side, self.strides = config.glimpse, tuple(strides[: config.glimpse_maps])
         width, hidden = config.glimpse_width, config.head_width
         self.look = nn.Sequential(
-            nn.Conv2d(channels, width, 3, padding=1, bias=False), nn.GroupNorm(4, width), nn.GELU(),
+            nn.Conv2d(sum(channels[: config.glimpse_maps]), width, 3, padding=1, bias=False),
+            nn.GroupNorm(4, width), nn.GELU(), *(GlimpseBlock(width) for _ in range(config.glimpse_blocks)),
             nn.Conv2d(width, width, 3, 2, 1, bias=False), nn.GroupNorm(4, width), nn.GELU(),
         )  # fmt: skip
-        last = nn.Linear(hidden, outputs)
+        self.detail = nn.Conv2d(channels[0], width, 4, 2, 1, bias=False) if config.glimpse_detail else None
+        last = OutputLinear(hidden, outputs)
         nn.init.normal_(last.weight, std=0.02)
         nn.init.zeros_(last.bias)
         self.judge = nn.Sequential(
@@ -99,8 +120,18 @@ class Glimpse(nn.Module):
             box: [x0, y0, x1, y1], px.
             place: the box in latent units, for the size that the grid takes away.
         """
-        points = glimpse_grid(box, self.side).flatten(1, 2)
-        seen = [sample_map(m, row, points, stride) for m, stride in zip(maps, self.strides)]
-        patch = torch.cat(seen, -1).unflatten(1, (self.side, self.side)).permute(0, 3, 1, 2)
-        look = self.look(patch.contiguous(memory_format=torch.channels_last))
+        first = self.look[0](self._patch(maps, row, box, self.side, self.strides))
+        if self.detail is not None:
+            first = first + self.detail(self._patch(maps, row, box, 2 * self.side, self.strides[:1]))
+        look = self.look[1:](first)
         return self.judge(torch.cat((look.flatten(1), place.to(look.dtype)), -1))
+
+    @staticmethod
+    def _patch(
+        maps: Sequence[Tensor], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"], side: int, strides: Sequence[int]
+    ) -> Float[Tensor, "n c side side"]:
+        """Samples of the maps of the given strides on a grid over each box."""
+        points = glimpse_grid(box, side).flatten(1, 2)
+        seen = [sample_map(m, row, points, stride) for m, stride in zip(maps, strides)]
+        patch = torch.cat(seen, -1).unflatten(1, (side, side)).permute(0, 3, 1, 2)
+        return patch.contiguous(memory_format=torch.channels_last)

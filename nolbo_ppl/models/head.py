@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.glimpse import Glimpse
+from nolbo_ppl.models.layers import OutputLinear
 from nolbo_ppl.models.scene import decode_box
 from nolbo_ppl.models.shape import bounded_exp
 
@@ -80,12 +81,12 @@ class RegionHead(nn.Module):
         self.sizes = (len(config.categories), 2 * d, 3 * modes, 4, 8, 8)
         outputs = config.predictors * sum(self.sizes)
         linear = config.encoder == "darknet19"
-        self.objectness = nn.Linear(channels, config.predictors, bias=not linear)
+        self.objectness = OutputLinear(channels, config.predictors, bias=not linear)
         width = config.head_width
         if linear:
-            self.outputs: nn.Module = nn.Linear(channels, outputs, bias=False)
+            self.outputs: nn.Module = OutputLinear(channels, outputs, bias=False)
         else:
-            last = nn.Linear(width, outputs)
+            last = OutputLinear(width, outputs)
             self.outputs = nn.Sequential(
                 nn.Linear(channels, width), nn.LayerNorm(width), nn.GELU(),
                 nn.Linear(width, width), nn.LayerNorm(width), nn.GELU(),
@@ -95,7 +96,7 @@ class RegionHead(nn.Module):
             nn.init.normal_(last.weight, std=0.02)
         self.glimpse: Glimpse | None = None
         if config.glimpse:
-            self.glimpse = Glimpse(sum(fine_channels), fine_strides, sum(self.sizes) - self.sizes[4], config)
+            self.glimpse = Glimpse(fine_channels, fine_strides, sum(self.sizes) - self.sizes[4], config)
         self.register_buffer("start", self._start(), persistent=False)
 
     def box_latent(self, raw: Float[Tensor, "*n outputs"]) -> Float[Tensor, "*n 4"]:

@@ -33,12 +33,16 @@ class _JointStatistics(_BatchNorm):
     """Batch normalisation by the statistics of the joint batch, on CPUs too.
 
     `torch.nn.SyncBatchNorm` refuses CPU tensors, and without shared statistics two processes do not train the same
-    network as one process with the joint batch. Alone in the world it is torch's own layer.
+    network as one process with the joint batch. Alone in the world it is torch's own layer, and where `joint` is unset:
+    processes that train by themselves between averages of their weights.
     """
+
+    joint = True
+    """Whether statistics are those of the joint batch of all processes."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Normalise by the joint statistics in training, by the running ones in evaluation."""
-        if not self.training or world_size() == 1:
+        if not self.training or not self.joint or world_size() == 1:
             return super().forward(input)
         assert self.running_mean is not None and self.running_var is not None and self.num_batches_tracked is not None
         x = input.float() if input.dtype == torch.bfloat16 else input
@@ -66,3 +70,10 @@ class SyncBatchNorm2d(_JointStatistics, nn.BatchNorm2d):
 
 class SyncBatchNorm3d(_JointStatistics, nn.BatchNorm3d):
     """For voxel grids."""
+
+
+def set_joint(module: nn.Module, joint: bool) -> None:
+    """Normalise by the joint batch of all processes, or each process by its own."""
+    for layer in module.modules():
+        if isinstance(layer, _JointStatistics):
+            layer.joint = joint

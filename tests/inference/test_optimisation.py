@@ -78,11 +78,12 @@ def test_a_step_is_adamw_by_hand() -> None:
     assert module.weight.grad.item() == pytest.approx(0.6, abs=1e-6)
 
 
-def scene_state(seed: int = 0) -> OptimisationState:
+def scene_state(seed: int = 0, optimizer: str = "adamw") -> OptimisationState:
     model = tiny_model(seed=seed)
     model.shape_guide.requires_grad_(False)
     loss = SceneLoss(model.story, model.guide, SceneElbo(scene_weights("inclusive", {"voxels": 0.01})))
-    return optimisation.init(model, loss, OptimisationConfig(steps=6, learning_rate=1e-2, warmup=2, decay=0.5, ema=0.9))
+    config = OptimisationConfig(steps=6, learning_rate=1e-2, warmup=2, decay=0.5, ema=0.9, optimizer=optimizer)
+    return optimisation.init(model, loss, config)
 
 
 @pytest.fixture
@@ -95,10 +96,11 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_resumed_run_equals_the_uninterrupted_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("optimizer", ["adamw", "muon"])
+def test_resumed_run_equals_the_uninterrupted_one(tmp_path: Path, optimizer: str) -> None:
     """Bit for bit, through a file, into networks that started elsewhere."""
     batches = [random_batch(tiny_config(), seed=step) for step in range(6)]
-    whole = scene_state()
+    whole = scene_state(optimizer=optimizer)
     infos = []
     for step, batch in enumerate(batches):
         _, info = optimisation.step(whole, batch, decode=4)
@@ -106,7 +108,7 @@ def test_resumed_run_equals_the_uninterrupted_one(tmp_path: Path) -> None:
         if step == 2:
             save_tensors(tmp_path / "state.safetensors", optimisation.state_tensors(whole), {"step": whole.step})
     tensors, meta = load_tensors(tmp_path / "state.safetensors")
-    resumed = optimisation.restore(scene_state(seed=5), tensors, meta["step"])
+    resumed = optimisation.restore(scene_state(5, optimizer), tensors, meta["step"])
     for step in range(3, 6):
         _, info = optimisation.step(resumed, batches[step], decode=4)
         assert info == infos[step]

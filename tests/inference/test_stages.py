@@ -10,12 +10,12 @@ import torch
 
 from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, SHAPE_STAGE, SceneElbo
 from nolbo_ppl.inference.monitor import held_out
-from nolbo_ppl.inference.optimisation import OptimisationConfig
+from nolbo_ppl.inference.optimisation import OptimisationConfig, restore, state_tensors
 from nolbo_ppl.inference.stages import OBJECTIVES, Stage, StageRun, scene_weights, seeded_noise, shorten
 from nolbo_ppl.models.nolbo import Nolbo
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from tests.factories import random_batch, run_in_two_processes, tiny_config, tiny_model
-from tests.gloo_worker import training
+from tests.gloo_worker import local_batch, local_run, training
 
 QUICK = OptimisationConfig(steps=4, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
 
@@ -162,3 +162,26 @@ def test_two_processes_train_as_one_with_the_joint_batch(tmp_path: Path) -> None
     for name, value in joint.items():
         assert torch.equal(first[name], second[name]), name
         torch.testing.assert_close(first[name], value.detach(), atol=1e-5, rtol=0, msg=name)
+
+
+@pytest.mark.slow
+def test_steps_made_alone_are_averaged(tmp_path: Path) -> None:
+    """Against two runs in this process that know nothing of each other and whose states are averaged by hand."""
+    first, second = run_in_two_processes("local", tmp_path)
+    assert set(first) == set(second)
+    runs = [local_run(0), local_run(0)]
+    for step in range(3):
+        for rank, run in enumerate(runs):
+            run.step(local_batch(rank, step))
+        if step == 0:
+            continue
+        states = [state_tensors(run.state) for run in runs]
+        assert any(not torch.equal(states[0][name], states[1][name]) for name in states[0])
+        mean = {
+            name: (value + states[1][name]) / 2 if value.is_floating_point() else value for name, value in states[0].items()
+        }
+        for name, value in mean.items():
+            assert torch.equal(first[f"{step}/{name}"], second[f"{step}/{name}"]), name
+            torch.testing.assert_close(first[f"{step}/{name}"], value, atol=1e-9, rtol=1e-9, msg=name)
+        for run in runs:
+            restore(run.state, mean, run.state.step)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.models.config import ModelConfig
-from nolbo_ppl.models.glimpse import LEAST_SIDE, MARGIN, glimpse_grid, sample_map
+from nolbo_ppl.models.glimpse import LEAST_SIDE, MARGIN, GlimpseBlock, glimpse_grid, sample_map
 from nolbo_ppl.models.scene import decode_box
 from tests.factories import random_batch, tiny_config, tiny_model
 
@@ -48,9 +50,10 @@ def test_a_map_of_one_cell_is_constant() -> None:
     torch.testing.assert_close(sample_map(maps, torch.tensor([0]), torch.rand(1, 7, 2) * 40, 16), torch.full((1, 7, 1), 2.5))
 
 
-def test_the_second_look_keeps_the_box_and_sees_only_its_surroundings() -> None:
-    """Outputs other than the box change, and they depend on the fine maps within the enlarged box alone."""
-    model = tiny_model(scatter=0.3).eval()
+@pytest.mark.parametrize("changes", [{}, {"glimpse_maps": 3, "glimpse_blocks": 1, "glimpse_detail": True}])
+def test_the_second_look_keeps_the_box_and_sees_only_its_surroundings(changes: dict[str, Any]) -> None:
+    """Outputs other than the box change, and they depend on the maps within the enlarged box alone."""
+    model = tiny_model(tiny_config(**changes), scatter=0.3).eval()
     head = model.guide.head
     batch = random_batch(tiny_config(), 2, 3, objects=2, seed=4)
     encoding = model.guide.encode(batch.image)
@@ -65,7 +68,9 @@ def test_the_second_look_keeps_the_box_and_sees_only_its_surroundings() -> None:
     box = decode_box(head.box_latent(raw), cell, encoding.columns, model.config)[0].detach()
     half = (box[2:] - box[:2]).mul(MARGIN).clamp_min(LEAST_SIDE) / 2
     low, high = (box[:2] + box[2:]) / 2 - half, (box[:2] + box[2:]) / 2 + half
-    for m, stride in zip(fine, model.guide.encoder.fine_strides, strict=True):
+    used_maps = model.config.glimpse_maps
+    assert all(m.grad is None for m in fine[used_maps:])
+    for m, stride in zip(fine[:used_maps], model.guide.encoder.fine_strides):
         assert float(m.grad[0].abs().sum()) == 0, "another image"
         used = m.grad[1].abs().sum(0).nonzero()[:, [1, 0]]
         assert len(used)
@@ -97,3 +102,35 @@ def test_configurations_without_a_second_look() -> None:
         ModelConfig(encoder="darknet19", image_size=448)
     with pytest.raises(InputError, match="multiple of 4"):
         tiny_config(glimpse_width=6)
+    with pytest.raises(InputError, match="glimpse_maps"):
+        tiny_config(glimpse_maps=4)
+
+
+def test_blocks_of_the_second_look_start_as_the_identity_and_learn() -> None:
+    block = GlimpseBlock(8)
+    x = torch.randn(2, 8, 5, 5, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(block(x), x, rtol=0, atol=0)
+    block(x).square().sum().backward()
+    assert float(block.branch[-1].weight.grad.abs().sum()) > 0
+
+
+def test_details_are_sampled_twice_as_densely() -> None:
+    """With everything but the detail's kernel silenced, each cell of the look holds the mean of its own 2 x 2 samples."""
+    config = tiny_config(glimpse_detail=True)
+    glimpse = tiny_model(config).guide.head.glimpse
+    width, side = config.glimpse_width, config.glimpse
+    fine = torch.randn(1, config.encoder_channels[1], 12, 12, generator=torch.Generator().manual_seed(2))
+    box, row = torch.tensor([[7.0, 9.0, 35.0, 40.0]]), torch.tensor([0])
+    kernel = torch.zeros_like(glimpse.detail.weight)
+    kernel[:, 0, 1:3, 1:3] = 0.25
+    seen: list[torch.Tensor] = []
+    with torch.no_grad():
+        glimpse.detail.weight.copy_(kernel)
+        glimpse.look[0].weight.zero_()
+        glimpse.look[1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+        glimpse([fine, torch.zeros(1, config.encoder_channels[2], 6, 6)], row, box, torch.zeros(1, 4))
+    points = glimpse_grid(box, side)
+    offset = (box[:, 2:] - box[:, :2]) * MARGIN / side / 4
+    corners = [points + offset * torch.tensor([a, b]) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    expected = sum(sample_map(fine, row, c.flatten(1, 2), 4)[..., 0] for c in corners) / 4
+    torch.testing.assert_close(seen[0], expected.view(1, 1, side, side).expand(1, width, side, side))
