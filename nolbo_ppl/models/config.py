@@ -162,8 +162,10 @@ class ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """The default for CPUs: 3.0 M parameters (1.8 M of them the image guide), 192 px, 32^3 voxels."""
-    return ModelConfig(image_size=192)
+    """The default for CPUs: 4.2 M parameters (3.0 M of them the image guide), 192 px, 32^3 voxels."""
+    return ModelConfig(
+        encoder_blocks=(1, 3, 4), glimpse_maps=3, glimpse_blocks=2, glimpse_detail=True, image_size=192
+    )
 
 
 def nano() -> ModelConfig:
@@ -173,6 +175,9 @@ def nano() -> ModelConfig:
         encoder_blocks=(0, 1, 1),
         head_width=96,
         glimpse_width=32,
+        glimpse_maps=3,
+        glimpse_blocks=1,
+        glimpse_detail=True,
         image_size=64,
         prior_width=32,
         decoder_channels=(32, 16, 8),

@@ -20,7 +20,7 @@ from nolbo_ppl.inference.slam.evidence import (
     candidate_pairs,
     log_population,
 )
-from nolbo_ppl.inference.slam.features import FeaturePrior
+from nolbo_ppl.inference.slam.features import FeaturePrior, correlated_variance
 from nolbo_ppl.inference.slam.graph import Estimate, Links
 from nolbo_ppl.inference.slam.online_graph import OnlineGraph
 from nolbo_ppl.inference.slam.state_types import link_scale
@@ -44,7 +44,7 @@ class Track:
     latent: Float[np.ndarray, " d"]
     """Fused latent."""
     latent_variance: Float[np.ndarray, " d"]
-    """Its variance."""
+    """Its variance, as if the views were independent."""
     category: int
     """Category of the first detection."""
     symmetry: int
@@ -145,7 +145,11 @@ class LoopCloser:
         others = np.arange(0, len(self.tracks), max(1, len(self.tracks) // POPULATION))
         everyone = np.concatenate([near, np.setdiff1d(others, near)])
         latent = np.array([self.tracks[j].latent for j in everyone.tolist()])
-        variance = np.array([self.tracks[j].latent_variance for j in everyone.tolist()])
+        views = np.array([len(self.tracks[j].rows) for j in everyone.tolist()], dtype=np.float64)
+        variance = correlated_variance(
+            np.array([self.tracks[j].latent_variance for j in everyone.tolist()]), views,
+            self.config.latent_correlation or 0.0,
+        )  # fmt: skip
         rarity = log_population(latent, variance, np.flatnonzero(inside))
         tracks, count = [self.tracks[j] for j in near.tolist()], len(near)
         first = np.array([t.first for t in tracks])
