@@ -27,6 +27,7 @@ from nolbo_ppl.data.loader import prefetch
 from nolbo_ppl.data.training import TrainingData
 from nolbo_ppl.inference import optimisation
 from nolbo_ppl.inference.calibrate import TooFewObjects, calibrate
+from nolbo_ppl.inference.growth import grow
 from nolbo_ppl.inference.journal import Journal
 from nolbo_ppl.inference.monitor import held_out
 from nolbo_ppl.inference.stages import StageRun
@@ -66,7 +67,10 @@ def run(config: TrainConfig) -> TrainSummary:
     data = TrainingData(config, rank, world)
     model = Nolbo.from_seed(data.model, config.seed)
     if config.initial is not None:
-        model.load_state_dict(load(config.initial).model.state_dict())
+        initial = load(config.initial).model
+        if config.grow:
+            initial = grow(initial, model.config, config.seed)
+        model.load_state_dict(initial.state_dict())
     journal = Journal(config, rank)
     stages = config.stages()
     first, tensors, at_step = journal.resume(model, stages)

@@ -30,7 +30,7 @@ from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.stages import StageRun
 from nolbo_ppl.inference.weights import load
 from nolbo_ppl.io import read_json, read_jsonl, write_jsonl
-from nolbo_ppl.models.config import ModelConfig, nano
+from nolbo_ppl.models.config import ModelConfig, nano, tiny
 from nolbo_ppl.train import TrainConfig, run
 
 
@@ -138,6 +138,23 @@ def test_a_run_can_start_from_trained_weights(
     assert changed and all(name.startswith("guide.") for name in changed)
     with pytest.raises(InputError, match="initial weights of another form"):
         config_of(folders, tmp_path / "other", initial=start, latent_dim=8).model()
+
+
+def test_a_run_can_start_from_grown_weights(folders: tuple[Path, Path], uninterrupted: Path, tmp_path: Path) -> None:
+    """The preset's blocks with everything else of the initial networks, whose weights are kept; and it trains."""
+    start = str(uninterrupted / "model")
+    grown = {"initial": start, "grow": True, "preset": "tiny", "shape_steps": 0, "single_steps": 0}
+    run(config_of(folders, tmp_path / "grown", scene_steps=0, **grown))
+    before, after = load(start).model, load(tmp_path / "grown" / "model").model
+    assert after.config.encoder_blocks == tiny().encoder_blocks
+    assert after.config.encoder_channels == before.config.encoder_channels == nano().encoder_channels
+    assert torch.equal(after.guide.encoder.deep[1].first[0].weight, before.guide.encoder.deep[1].first[0].weight)
+    assert torch.equal(after.guide.encoder.deep[3].norm.weight, torch.zeros(nano().encoder_channels[3]))
+    run(config_of(folders, tmp_path / "trained", scene_steps=2, **grown))
+    moved = load(tmp_path / "trained" / "model").model.guide.encoder.deep[3].norm.weight
+    assert float(moved.abs().sum()) > 0
+    with pytest.raises(InputError, match="networks to grow: got no initial weights"):
+        config_of(folders, tmp_path / "none", grow=True)
 
 
 def test_mixed_difficulties_are_thirds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.elbo import SHAPE_STAGE
+from nolbo_ppl.inference.growth import grown_config
 from nolbo_ppl.inference.optimisation import OptimisationConfig
 from nolbo_ppl.inference.stages import Stage, scene_weights
 from nolbo_ppl.inference.weights import load
@@ -22,7 +23,7 @@ FREE_FIELDS = (
     "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
-OPTIONAL_FIELDS = ("categories", "symmetry")
+OPTIONAL_FIELDS = ("categories", "symmetry", "grow")
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
@@ -65,6 +66,8 @@ class TrainConfig:
     initial: str | None = None
     """Weights to start from: a name of shipped weights, or the folder of a model; the networks' configuration is theirs.
     With `--shape-steps 0` the shape networks stay as they are."""
+    grow: bool = False
+    """Grow the initial networks to the blocks and the second look of the preset (`nolbo_ppl.inference.growth`)."""
     cache: Path = DEFAULT_CACHE
     """Where generated scenes are kept."""
     seed: int = 0
@@ -134,6 +137,8 @@ class TrainConfig:
             raise input_error("freeze", got=self.freeze, expected="a share from 0 to 1")
         if any(size % 32 or size <= 0 for size in self.sizes):
             raise input_error("sizes", got=self.sizes, expected="positive multiples of 32")
+        if self.grow and self.initial is None:
+            raise input_error("networks to grow", got="no initial weights", do="give --initial, or leave --grow out")
         if self.instance_labels and self.scenes is None:
             raise input_error("instance labels", got="generated scenes", do="give --scenes with its own instances")
         if self.validation is not None and self.scenes is None:
@@ -163,6 +168,8 @@ class TrainConfig:
                     expected=f"{' '.join(self.categories)} of symmetry {' '.join(map(str, self._symmetry()))}",
                     do="leave --categories and --symmetry out, or train without --initial",
                 )
+            if self.grow:
+                config = grown_config(config, PRESETS[self.preset]())
             return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)
         changes: dict[str, Any] = {}
         if self.categories:
