@@ -89,8 +89,8 @@ VARIANTS = {
     "latent-128": Variant("latent", "128 dimensions", {"latent_dim": 128}),
     "adamw": Variant("optimiser", "AdamW throughout", {"optimizer": "adamw"}),
     "no-glimpse": Variant("second look", "none", networks={"glimpse": 0}),
-    "plain-glimpse": Variant("second look", "two maps, no residual blocks, no details",
-                             networks={"glimpse_maps": 2, "glimpse_blocks": 0, "glimpse_detail": False}),
+    "deep-glimpse": Variant("second look", "three maps, a residual block, details",
+                            networks={"glimpse_maps": 3, "glimpse_blocks": 1, "glimpse_detail": True}),
     "category-prior": Variant("prior", "named instances, category prior only", folder=True),
     "instance-prior": Variant("prior", "named instances, category and instance prior", {"instance_labels": True}, folder=True),
 }  # fmt: skip
