@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ from nolbo_ppl.models.scene import cell_of, decode_box
 
 CANDIDATE = 0.02
 """Regions of at least this objectness count towards the object they describe."""
+
+Found: TypeAlias = tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, "n 4"] | None]
+"""Regions of a batch to answer for: image, number, log odds, and boxes to look at where they are given, px."""
 
 
 class ObservationModel:
@@ -107,8 +110,8 @@ class ObservationModel:
         if not 0 < threshold < 1:
             raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
 
-        def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-            return self._detections(encoding, logit, threshold, iou_threshold)
+        def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
+            return *self._detections(encoding, logit, threshold, iou_threshold), None
 
         results = self._observe(prepared, detect, decode, samples, seed, batch)
         return results[0] if single else results
@@ -127,17 +130,19 @@ class ObservationModel:
     ) -> list[Observations]:
         """Posterior of the region responsible for each given box (px of the given image), in the order of the boxes.
 
-        The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation).
+        The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation). The
+        guide takes its second look at the given box.
         """
         if len(boxes) != len(images):
             raise input_error("boxes", got=f"{len(boxes)} lists", expected=f"one list for each of {len(images)} images")
         prepared = self._prepare_all(images, intrinsics, size)
 
-        def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+        def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
             scaled = [np.asarray(boxes[i], dtype=np.float64).reshape(-1, 4) * np.tile(prepared[i].scale, 2) for i in group]
             row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
-            region = self._responsible(encoding, row, torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype))
-            return row, region, logit[row, region]
+            box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
+            region = self._responsible(encoding, row, box)
+            return row, region, logit[row, region], box
 
         return self._observe(prepared, responsible, decode, samples, seed, batch)
 
@@ -150,13 +155,13 @@ class ObservationModel:
     def _observe(
         self,
         prepared: list[Prepared],
-        find: Callable[[Encoding, Tensor, list[int]], tuple[Tensor, Tensor, Tensor]],
+        find: Callable[[Encoding, Tensor, list[int]], Found],
         decode: bool,
         samples: int,
         seed: int,
         batch: int,
     ) -> list[Observations]:
-        """Run batches of images of one shape; `find` gives row, region and log odds of what to answer for."""
+        """Run batches of images of one shape; `find` gives what to answer for."""
 
         def shapes(q: RegionParameters, diagonal: Tensor) -> ShapeAnswer:
             metres = diagonal.numpy()
@@ -169,10 +174,10 @@ class ObservationModel:
         for group in same_shape(prepared, batch):
             encoding = self.encode(torch.stack([prepared[i].image for i in group]))
             logit = self.calibration.objectness(encoding.objectness_logit)
-            row, region, odds = find(encoding, logit, group)
+            row, region, odds, look_at = find(encoding, logit, group)
             camera = torch.stack([prepared[i].camera for i in group])[row]
             scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
-            regions = Regions(self._parameters(encoding, row, region), region, encoding.columns, odds, camera, scale)
+            regions = Regions(self._parameters(encoding, row, region, look_at), region, encoding.columns, odds, camera, scale)
             answer = assemble(regions, self.config, self.model.story.prior, self._prior_mean, shapes)
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
             for k, i in enumerate(group):
@@ -182,8 +187,10 @@ class ObservationModel:
     def _prepare_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[Prepared]:
         return prepare_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
 
-    def _parameters(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> RegionParameters:
-        q = self.model.guide.parameters_at(encoding, row, region)
+    def _parameters(
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
+    ) -> RegionParameters:
+        q = self.model.guide.parameters_at(encoding, row, region, box=box)
         return self.calibration.apply(q.at_mode(self._prior_mean))
 
     def _boxes(

@@ -98,7 +98,8 @@ class Guide(nn.Module):
         return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine)
 
     def parameters_at(
-        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], look: bool = True
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], look: bool = True,
+        box: Float[Tensor, "n 4"] | None = None,
     ) -> RegionParameters:
         """Posterior parameters of given regions.
 
@@ -107,13 +108,14 @@ class Guide(nn.Module):
             row: the image of each region.
             region: its number, cell * predictors + predictor.
             look: take the second look at each region's box. Boxes are the same without it, and soon found.
+            box: boxes to look at instead of the regions' own, px.
         """
         cell, predictor = region // self.config.predictors, region % self.config.predictors
         with self._autocast():
             raw = self.head(encoding.features[row, cell])[torch.arange(len(row)), predictor]
             raw = raw.to(self.head.objectness.weight.dtype)
             if look:
-                raw = self.head.refine(raw, encoding.fine, row, cell, encoding.columns)
+                raw = self.head.refine(raw, encoding.fine, row, cell, encoding.columns, box)
         return self.head.parameters_of(raw, self._prior().label_mean())
 
     def _raw(self, encoding: Encoding, cell: Int[Tensor, "b m"]) -> Float[Tensor, "b m predictors outputs"]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.glimpse import Glimpse
 from nolbo_ppl.models.layers import OutputLinear
-from nolbo_ppl.models.scene import decode_box
+from nolbo_ppl.models.scene import decode_box, encode_box
 from nolbo_ppl.models.shape import bounded_exp
 
 
@@ -106,9 +106,9 @@ class RegionHead(nn.Module):
 
     def refine(
         self, raw: Float[Tensor, "n outputs"], maps: Sequence[Tensor], row: Int[Tensor, " n"], cell: Int[Tensor, " n"],
-        columns: int,
+        columns: int, box: Float[Tensor, "n 4"] | None = None,
     ) -> Float[Tensor, "n outputs"]:
-        """Raw outputs after the second look at each region's own box; the box itself stays as it is.
+        """Raw outputs after the second look at each region's own box, or at a given one; the box itself stays as it is.
 
         Args:
             raw: outputs of the regions from their cells.
@@ -116,11 +116,15 @@ class RegionHead(nn.Module):
             row: the image of each region.
             cell: the cell of each region.
             columns: cells in a row of the image.
+            box: where to look, [x0, y0, x1, y1], px, instead of at the region's own box.
         """
         if self.glimpse is None:
             return raw
-        place = self.box_latent(raw).detach()
-        box = decode_box(place, cell, columns, self.config)
+        if box is None:
+            place = self.box_latent(raw).detach()
+            box = decode_box(place, cell, columns, self.config)
+        else:
+            place = encode_box(box, cell, columns, self.config)
         change = self.glimpse(maps, row, box, place.clamp(-8, 8)).to(raw.dtype)
         first = sum(self.sizes[:4])
         keep = change.new_zeros(len(change), self.sizes[4])

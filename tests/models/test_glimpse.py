@@ -10,7 +10,7 @@ import torch
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.glimpse import LEAST_SIDE, MARGIN, GlimpseBlock, glimpse_grid, sample_map
-from nolbo_ppl.models.scene import decode_box
+from nolbo_ppl.models.scene import decode_box, encode_box
 from tests.factories import random_batch, tiny_config, tiny_model
 
 
@@ -91,6 +91,27 @@ def test_objects_are_refined_the_same_alone_and_in_company() -> None:
         alone = model.guide.parameters_at(scene.encoding, torch.tensor([b]), region[None])
         torch.testing.assert_close(alone.shape_loc[0], scene.posterior.shape_loc[b, m])
         torch.testing.assert_close(alone.azimuth_natural[0], scene.posterior.azimuth_natural[b, m])
+
+
+def test_a_given_box_is_looked_at_instead_of_the_own_one() -> None:
+    """The own box given changes nothing; at another one the outputs are the cell's plus what the glimpse adds there."""
+    model = tiny_model(scatter=0.3).eval()
+    guide, head = model.guide, model.guide.head
+    encoding = guide.encode(random_batch(tiny_config(), 2, 3, objects=2, seed=4).image)
+    row, region = torch.tensor([0, 1]), torch.tensor([3, 10])
+    cell = region // model.config.predictors
+    own = guide.parameters_at(encoding, row, region)
+    box = decode_box(own.box_loc, cell, encoding.columns, model.config)
+    same = guide.parameters_at(encoding, row, region, box=box)
+    torch.testing.assert_close(same.label_logits, own.label_logits)
+    given = box + torch.tensor([4.0, -3.0, 9.0, 6.0])
+    other = guide.parameters_at(encoding, row, region, box=given)
+    torch.testing.assert_close(other.box_loc, own.box_loc)
+    raw = head(encoding.features[row, cell])[torch.arange(2), region % model.config.predictors]
+    change = head.glimpse(encoding.fine, row, given, encode_box(given, cell, encoding.columns, model.config).clamp(-8, 8))
+    labels = len(model.config.categories)
+    torch.testing.assert_close(other.label_logits, raw[:, :labels] + change[:, :labels])
+    assert not torch.allclose(other.label_logits, own.label_logits)
 
 
 def test_configurations_without_a_second_look() -> None:
