@@ -360,7 +360,10 @@ def test_given_boxes_are_answered_in_order() -> None:
         own = torch.cat([decode_box(q.box_loc, torch.tensor([cell]), 4, model.config) for q in rows])
         best = int(pairwise_iou(own, torch.from_numpy(box)[None])[:, 0].argmax())
         np.testing.assert_allclose(found.box[i], 2 * own[best].numpy())
-        mode = rows[best].at_mode(model.model.story.prior.label_mean())
+        look = model.model.guide.parameters_at(
+            encoding, torch.tensor([0]), torch.tensor([2 * cell + best]), box=torch.from_numpy(box)[None]
+        )
+        mode = look.at_mode(model.model.story.prior.label_mean())
         np.testing.assert_allclose(found.latent[i], mode.shape_loc[0].detach().numpy())
 
 
