@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Iterable
 
 import torch
 from jaxtyping import Float, Int
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 from torch import Tensor
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import wrap_angle
+from nolbo_ppl.inference.answers import position_covariance
 from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.distributions import VonMisesMixture
+from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.nolbo import Nolbo
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.scene import Assignment, SceneBatch, decode_box, decode_range
 
 LEAST_OBJECTS = 50
 """Fewer held-out objects than this fix no factor."""
@@ -32,6 +36,26 @@ def region_factor(squared: Float[Tensor, " n"], dimensions: int, level: float = 
     objects that are taken for something else, and leave the region of all others too wide.
     """
     return float(torch.sqrt(torch.quantile(squared.double(), level) / chi2.ppf(level, dimensions)))
+
+
+def position_factor(
+    error: Float[Tensor, "n 3"], by_range: Float[Tensor, "n 3 3"], by_box: Float[Tensor, "n 3 3"], level: float = 0.9
+) -> float:
+    """Factor f after which the `level` region of covariances `f^2 by_range + by_box` covers just that share of the errors.
+
+    Limited to [0.05, 20], where no factor in between does.
+    """
+    wanted = chi2.ppf(level, 3)
+
+    def excess(log_factor: float) -> float:
+        covariance = math.exp(2 * log_factor) * by_range + by_box
+        solved = torch.linalg.solve(covariance, error[..., None])[..., 0]
+        return float(torch.log(torch.quantile((error * solved).sum(-1), level).clamp_min(1e-300) / wanted))
+
+    low, high = math.log(0.05), math.log(20.0)
+    if excess(low) <= 0:
+        return math.exp(low)
+    return math.exp(high if excess(high) >= 0 else brentq(excess, low, high, xtol=1e-4))
 
 
 def view_correlation(error: Float[Tensor, "n d"], group: Int[Tensor, " n"]) -> float:
@@ -89,8 +113,8 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
         add("angle", angle.square().sum(-1))
         box = (q.box_loc - where.box_target)[mask] / q.box_scale[mask]
         add("box", box.square().sum(-1))
-        ranged = mask & where.has_range
-        add("range", ((q.range_loc - where.range_target)[ranged] / q.range_scale[ranged])[:, :3].square().sum(-1))
+        for name, value in _positions(model, scene.encoding.columns, batch, q, where, mask & where.has_range).items():
+            add(name, value)
         if batch.shape_loc is not None:
             shaped = mask & batch.has_voxels
             error = (q.shape_loc - batch.shape_loc)[shaped] / q.shape_scale[shaped]
@@ -99,6 +123,25 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
                 add("shape_error", error)
                 add("shape_index", batch.shape_index[shaped])
     return {name: torch.cat(values) for name, values in found.items()}
+
+
+def _positions(
+    model: Nolbo, columns: int, batch: SceneBatch, q: RegionParameters, where: Assignment, mask: Tensor
+) -> dict[str, Tensor]:
+    """Errors of the positions, and their covariances by the range latent alone and by the box alone, as answers have them."""
+    config, cell = model.config, where.cell[mask]
+    at = q.map(lambda value: value[mask])
+    camera = batch.intrinsics[:, None].expand(-1, mask.shape[1], -1)[mask]
+    box = decode_box(at.box_loc, cell, columns, config)
+    box_scale = at.box_scale * at.box_scale.new_tensor(config.box_spread)
+    box_scale[:, :2] *= config.stride
+    position, _ = decode_range(at.range_loc, box, camera, config)
+    still = dataclasses.replace(at, range_scale=torch.zeros_like(at.range_scale))
+    return {
+        "position": batch.position[mask].double() - position.double(),
+        "by_range": position_covariance(at, box, torch.zeros_like(box_scale), position, camera, config),
+        "by_box": position_covariance(still, box, box_scale, position, camera, config),
+    }
 
 
 def _shape_correlation(found: dict[str, Tensor]) -> float:
@@ -111,7 +154,7 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
     """Fit every factor on labelled held-out scenes the network was not trained on.
 
     Objectness, label and azimuth by maximum likelihood (they are proper scores of discrete or multimodal answers),
-    Gaussian heads by their 90 % regions.
+    Gaussian heads by their 90 % regions: the range's by that of the position, which is what answers state.
 
     Raises:
         TooFewObjects: the scenes hold fewer than `LEAST_OBJECTS` objects.
@@ -138,6 +181,10 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
     label_slope = _fit(label, [0.0])[0] if len(found["category"]) else 0.0
     concentration = _fit(azimuth, [0.0])[0] if len(found["azimuth"]) else 0.0
     factor = torch.tensor([slope, label_slope, concentration]).exp().tolist()
+    box_scale = region_factor(found["box"], 4)
+    range_scale = 1.0
+    if len(found["position"]):
+        range_scale = position_factor(found["position"], found["by_range"], box_scale**2 * found["by_box"])
     return Calibration(
         objectness_slope=factor[0],
         objectness_shift=shift,
@@ -145,7 +192,7 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
         azimuth_concentration=factor[2],
         angle_scale=region_factor(found["angle"], 2) if len(found["angle"]) else 1.0,
         shape_scale=region_factor(found["shape"], model.config.latent_dim) if len(found.get("shape", ())) else 1.0,
-        box_scale=region_factor(found["box"], 4),
-        range_scale=region_factor(found["range"], 3) if len(found["range"]) else 1.0,
+        box_scale=box_scale,
+        range_scale=range_scale,
         shape_correlation=_shape_correlation(found),
     )

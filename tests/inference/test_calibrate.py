@@ -10,10 +10,10 @@ from scipy.stats import chi2
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference import calibrate as module
-from nolbo_ppl.inference.calibrate import calibrate, region_factor, view_correlation
+from nolbo_ppl.inference.calibrate import calibrate, position_factor, region_factor, view_correlation
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.guide import Guide, ObservedScene
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.scene import SceneBatch, decode_box, decode_range, encode_box
 from tests.factories import observed_scene, random_batch, random_posterior, tiny_config, tiny_model
 
 
@@ -24,6 +24,28 @@ def test_region_factor_makes_the_region_cover() -> None:
     assert factor == pytest.approx(1.7, rel=0.02)
     inside = (error / factor).square().sum(-1) <= chi2.ppf(0.9, 3)
     assert float(inside.double().mean()) == pytest.approx(0.9, abs=1e-3)
+
+
+@pytest.mark.parametrize("factor", [0.4, 1.8])
+def test_position_factor_makes_the_region_cover(factor: float) -> None:
+    """Errors drawn from covariances of which one part was multiplied by a known factor."""
+    g = torch.Generator().manual_seed(2)
+    root = torch.randn(2, 20000, 3, 3, generator=g, dtype=torch.float64)
+    by_range, by_box = root @ root.mT + 0.01 * torch.eye(3, dtype=torch.float64)
+    noise = torch.randn(20000, 3, 1, generator=g, dtype=torch.float64)
+    error = (torch.linalg.cholesky(factor**2 * by_range + by_box) @ noise)[..., 0]
+    found = position_factor(error, by_range, by_box)
+    assert found == pytest.approx(factor, rel=0.05)
+    solved = torch.linalg.solve(found**2 * by_range + by_box, error[..., None])[..., 0]
+    assert float(((error * solved).sum(-1) <= chi2.ppf(0.9, 3)).double().mean()) == pytest.approx(0.9, abs=1e-3)
+
+
+def test_position_factor_has_limits() -> None:
+    """A box alone that explains too much, and errors that nothing explains."""
+    eye = torch.eye(3, dtype=torch.float64).expand(60, 3, 3)
+    error = torch.ones(60, 3, dtype=torch.float64)
+    assert position_factor(1e-3 * error, eye, eye) == pytest.approx(0.05)
+    assert position_factor(1e3 * error, eye, eye) == pytest.approx(20)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.35, 0.8])
@@ -56,8 +78,11 @@ def test_distorted_scales_and_odds_are_found(monkeypatch: pytest.MonkeyPatch) ->
     def scattered(loc: torch.Tensor, scale: torch.Tensor, factor: float) -> torch.Tensor:
         return loc + factor * scale * torch.randn_like(loc)
 
-    where.box_target = scattered(q.box_loc, q.box_scale, 1.5)
-    where.range_target = scattered(q.range_loc, q.range_scale, 0.6)
+    q.range_scale, q.box_scale = q.range_scale / 8, q.box_scale / 8  # covariances of positions are of first order
+    box = decode_box(scattered(q.box_loc, q.box_scale, 1.5), where.cell, scene.encoding.columns, config)
+    camera = batch.intrinsics[:, None].expand(-1, 6, -1)
+    position, diagonal = decode_range(scattered(q.range_loc, q.range_scale, 0.6), box, camera, config)
+    where.box_target = encode_box(box, where.cell, scene.encoding.columns, config)
     truth = VonMisesMixture(q.azimuth_logits, 0.4 * q.azimuth_natural).sample()
     angles = scattered(q.angle_loc, q.angle_scale, 2.0)
     category = torch.distributions.Categorical(logits=0.5 * q.label_logits).sample()
@@ -66,6 +91,8 @@ def test_distorted_scales_and_odds_are_found(monkeypatch: pytest.MonkeyPatch) ->
     batch = scene.batch.replace(
         viewpoint=torch.cat((truth[..., None], angles), -1),
         category=category,
+        position=position,
+        diagonal=diagonal,
         symmetry=torch.ones_like(batch.symmetry),
         shape_loc=scattered(q.at_mode(model.story.prior.label_mean()).shape_loc, q.shape_scale, 1.2),
     )
