@@ -3,7 +3,8 @@
     python benchmarks/training_curve.py --runs runs/a runs/b --out docs/images/training.png
 
 Runs are those that were trained one from the other, in order; each goes on where the one before stopped. Reads their
-`metrics.jsonl`, whose rows have the seconds of the stages; writes a picture and, beside it, the same numbers as JSON.
+`metrics.jsonl`, whose rows have the seconds of the stages, and the figures at the end of a run that came to it;
+writes a picture and, beside it, the same numbers as JSON.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 import tyro
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io import write_json
+from nolbo_ppl.io import read_json, write_json
 from nolbo_ppl.viz.style import grid, new_figure, save, styled
 from nolbo_ppl.viz.training import FIGURES, read_metrics
 
@@ -55,6 +56,13 @@ def curve(runs: tuple[Path, ...], stop: tuple[int, ...] = ()) -> list[dict[str, 
                 figures = {name: row[name] for name in (*FIGURES, "med_err_deg") if name in row}
                 rows.append({"seconds": round(total + reached, 1), "run": folder.name, "step": row["step"], **figures})
         before = total + reached
+        final = folder / "model" / "config.json"
+        if not last and final.is_file():
+            known = read_json(final).get("held_out", {})
+            figures = {name: known[name] for name in (*FIGURES, "med_err_deg") if name in known}
+            if figures:
+                end = {"seconds": round(before, 1), "run": folder.name, "step": read_metrics(folder)[-1]["step"]}
+                rows.append({**end, **figures})
     return rows
 
 
@@ -75,7 +83,7 @@ def main() -> None:
         for name, seconds in starts.items():
             axes.annotate(name, (seconds, 0.03), fontsize=7, color="#79706e")
         axes.set(xlabel="CPU-seconds of training", ylabel="held-out scenes", ylim=(0, 1.02))
-        axes.legend(loc="lower right", fontsize=8)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 0.2), fontsize=8)
         grid(axes)
         figure.tight_layout()
     save(figure, arguments.out)
