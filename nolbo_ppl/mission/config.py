@@ -42,7 +42,7 @@ class RunConfig:
     """Of those, keep one this far from the last, m; with `keyframe_angle` 0 as well, all are kept."""
     keyframe_angle: float = 0.0
     """Or turned by this much, rad."""
-    sizes: tuple[int, ...] = (768,)
+    sizes: tuple[int, ...] = (576,)
     """Longer sides, px, at which the model looks at each image: one for pictures like those it was trained on, more where
     near objects are many times larger than far ones."""
     threshold: float = 0.6
