@@ -45,7 +45,8 @@ def curve(runs: tuple[Path, ...], stop: tuple[int, ...] = ()) -> list[dict[str, 
     for number, folder in enumerate(runs):
         last = stop[number] if stop else 0
         total, stage, reached = before, None, 0.0
-        for row in read_metrics(folder):
+        metrics = read_metrics(folder)
+        for row in metrics:
             if row["stage"] != stage:
                 stage, total, reached = row["stage"], total + reached, 0.0
             if last and stage == "scenes" and row["step"] > last:
@@ -61,7 +62,7 @@ def curve(runs: tuple[Path, ...], stop: tuple[int, ...] = ()) -> list[dict[str, 
             known = read_json(final).get("held_out", {})
             figures = {name: known[name] for name in (*FIGURES, "med_err_deg") if name in known}
             if figures:
-                end = {"seconds": round(before, 1), "run": folder.name, "step": read_metrics(folder)[-1]["step"]}
+                end = {"seconds": round(before, 1), "run": folder.name, "step": metrics[-1]["step"]}
                 rows.append({**end, **figures})
     return rows
 

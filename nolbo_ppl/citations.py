@@ -39,6 +39,12 @@ REFERENCES: dict[str, str] = {
   booktitle = {IEEE Winter Conference on Applications of Computer Vision},
   year = {2014}
 }""",
+    "muon": """@misc{jordan2024muon,
+  title = {Muon: An optimizer for hidden layers in neural networks},
+  author = {Jordan, Keller and others},
+  year = {2024},
+  howpublished = {https://kellerjordan.github.io/posts/muon/}
+}""",
     "gtsam": """@misc{dellaert2012gtsam,
   title = {Factor Graphs and GTSAM: A Hands-on Introduction},
   author = {Dellaert, Frank},

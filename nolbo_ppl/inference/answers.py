@@ -54,8 +54,7 @@ def assemble(
     """
     q, camera, scale = regions.q, regions.camera, regions.scale
     box = decode_box(q.box_loc, regions.number // config.predictors, regions.columns, config)
-    box_scale = q.box_scale * q.box_scale.new_tensor(config.box_spread)
-    box_scale[:, :2] *= config.stride
+    box_scale = box_scales(q, config)
     position, diagonal = decode_range(q.range_loc, box, camera, config)
     azimuth = VonMisesMixture(
         q.azimuth_logits, q.azimuth_natural, max_concentration=config.max_concentration, validate_args=False
@@ -91,6 +90,12 @@ def assemble(
         voxel_mean=voxel_mean,
         voxel_variance=voxel_variance,
     )
+
+
+def box_scales(q: RegionParameters, config: ModelConfig) -> Float[Tensor, "n 4"]:
+    """Scales of each box's centre, px of the scaled image, and of its log extents."""
+    scale = q.box_scale * q.box_scale.new_tensor(config.box_spread)
+    return torch.cat((scale[:, :2] * config.stride, scale[:, 2:]), -1)
 
 
 def category_log_likelihood(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import wrap_angle
-from nolbo_ppl.inference.answers import position_covariance
+from nolbo_ppl.inference.answers import box_scales, position_covariance
 from nolbo_ppl.models.calibration import Calibration
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.head import RegionParameters
@@ -133,8 +133,7 @@ def _positions(
     at = q.map(lambda value: value[mask])
     camera = batch.intrinsics[:, None].expand(-1, mask.shape[1], -1)[mask]
     box = decode_box(at.box_loc, cell, columns, config)
-    box_scale = at.box_scale * at.box_scale.new_tensor(config.box_spread)
-    box_scale[:, :2] *= config.stride
+    box_scale = box_scales(at, config)
     position, _ = decode_range(at.range_loc, box, camera, config)
     still = dataclasses.replace(at, range_scale=torch.zeros_like(at.range_scale))
     return {

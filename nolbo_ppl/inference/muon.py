@@ -3,12 +3,12 @@
 Muon (K. Jordan et al., 2024) turns the momentum of each hidden matrix into its nearest semi-orthogonal matrix, so that
 all directions learn at one pace; `torch.optim.Muon` takes matrices only, so kernels are handed to it as matrices of one
 row per output channel. Its steps have the root mean square of AdamW's (Liu et al., 2025), so that both share a rate.
-Layers whose outputs are parameters of distributions (`OutputLinear`) and kernels over the image's own colours keep AdamW.
+Layers of the guide whose outputs are parameters of distributions (`OutputLinear`) and kernels over the image's own colours keep AdamW.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -30,6 +30,16 @@ def hidden_matrices(module: nn.Module) -> dict[str, nn.Parameter]:
     }
 
 
+def adamw(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float) -> torch.optim.AdamW:
+    """AdamW whose weight decay spares vectors: biases and norms."""
+    known = list(parameters)
+    groups: list[dict[str, Any]] = [
+        {"params": [p for p in known if p.dim() > 1], "weight_decay": weight_decay},
+        {"params": [p for p in known if p.dim() <= 1], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW([group for group in groups if group["params"]], lr=lr, betas=(0.9, 0.99), fused=True)
+
+
 class MuonAdamW(torch.optim.Optimizer):
     """Muon on the hidden matrices of a module, AdamW on its other trainable parameters.
 
@@ -46,12 +56,11 @@ class MuonAdamW(torch.optim.Optimizer):
         hidden = list(hidden_matrices(module).values())
         taken = {id(p) for p in hidden}
         others = [p for p in module.parameters() if p.requires_grad and id(p) not in taken]
-        groups: list[dict[str, Any]] = [
-            {"params": hidden, "weight_decay": weight_decay},
-            {"params": [p for p in others if p.dim() > 1], "weight_decay": weight_decay},
-            {"params": [p for p in others if p.dim() <= 1], "weight_decay": 0.0},
-        ]
-        super().__init__([group for group in groups if group["params"]], {"lr": lr})
+        rest = [adamw(others, lr, weight_decay)] if others else []
+        groups: list[dict[str, Any]] = [{"params": hidden, "weight_decay": weight_decay}] if hidden else []
+        for part in rest:
+            groups += [{name: group[name] for name in ("params", "weight_decay")} for group in part.param_groups]
+        super().__init__(groups, {"lr": lr})
         self.pace = pace
         self._hidden = hidden
         self._flat = [nn.Parameter(p.detach().flatten(1).clone()) for p in hidden]
@@ -62,12 +71,10 @@ class MuonAdamW(torch.optim.Optimizer):
             )
             for p, flat in zip(hidden, self._flat):
                 self.state[p] = self._parts[0].state[flat]
-        plain = [dict(group) for group in groups[1:] if group["params"]]
-        if plain:
-            adam = torch.optim.AdamW(plain, lr=lr, betas=(0.9, 0.99), fused=True)
-            self._parts.append(adam)
+        for part in rest:
+            self._parts.append(part)
             for p in others:
-                self.state[p] = adam.state[p]
+                self.state[p] = part.state[p]
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.inference.checkpoint import optimizer_tensors, restore_optimizer
 from nolbo_ppl.inference.elbo import ElboResult
-from nolbo_ppl.inference.muon import MuonAdamW
+from nolbo_ppl.inference.muon import MuonAdamW, adamw
 
 
 @dataclass(frozen=True)
@@ -98,12 +98,7 @@ def make_optimizer(module: nn.Module, config: OptimisationConfig) -> torch.optim
     """The optimiser a configuration names, over the parameters that require a gradient."""
     if config.optimizer == "muon":
         return MuonAdamW(module, config.learning_rate, config.weight_decay, config.pace)
-    trainable = [p for p in module.parameters() if p.requires_grad]
-    groups = [
-        {"params": [p for p in trainable if p.dim() > 1], "weight_decay": config.weight_decay},
-        {"params": [p for p in trainable if p.dim() <= 1], "weight_decay": 0.0},
-    ]
-    return torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
+    return adamw((p for p in module.parameters() if p.requires_grad), config.learning_rate, config.weight_decay)
 
 
 def step(state: OptimisationState, *args: Any, **kwargs: Any) -> tuple[OptimisationState, StepInfo]:
