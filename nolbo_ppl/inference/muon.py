@@ -3,7 +3,8 @@
 Muon (K. Jordan et al., 2024) turns the momentum of each hidden matrix into its nearest semi-orthogonal matrix, so that
 all directions learn at one pace; `torch.optim.Muon` takes matrices only, so kernels are handed to it as matrices of one
 row per output channel. Its steps have the root mean square of AdamW's (Liu et al., 2025), so that both share a rate.
-Layers of the guide whose outputs are parameters of distributions (`OutputLinear`) and kernels over the image's own colours keep AdamW.
+Layers of the guide whose outputs are parameters of distributions (`OutputLinear`) and kernels over the image's own colours
+keep AdamW.
 """
 
 from __future__ import annotations
