@@ -23,21 +23,22 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from nolbo_ppl import __version__, evaluate
-from nolbo_ppl.data.dataset import write_scenes
+from nolbo_ppl import __version__
+from nolbo_ppl.cli import evaluate
+from nolbo_ppl.cli.evaluate import EvaluateConfig
+from nolbo_ppl.cli.train import TrainConfig, run
 from nolbo_ppl.data.loader import prefetch
-from nolbo_ppl.data.scene_config import preset as scene_preset
-from nolbo_ppl.data.scene_config import rendered_size
-from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.data.training import TrainingData
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.evaluate import EvaluateConfig
 from nolbo_ppl.inference.elbo import INCLUSIVE
-from nolbo_ppl.inference.stages import StageRun
-from nolbo_ppl.io import atomic_path, read_json, write_json
-from nolbo_ppl.models.config import ModelConfig
-from nolbo_ppl.models.nolbo import Nolbo
-from nolbo_ppl.train import TrainConfig, run
+from nolbo_ppl.io.files import atomic_path, read_json, write_json
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.synthetic.dataset_writer import write_scenes
+from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
+from nolbo_ppl.synthetic.scenes.scene_config import rendered_size
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.training.stage_data import TrainingData
+from nolbo_ppl.training.stages import StageRun
 
 SHARES = {"shapes": 0.25, "single": 0.02, "scenes": 0.73}
 """Shares of the seconds that the stages get; a variant without a stage gives its share to the scenes."""

@@ -27,7 +27,7 @@ from nolbo_ppl.inference.association import (
     map_association,
     sample_associations,
 )
-from nolbo_ppl.io import write_json
+from nolbo_ppl.io.files import write_json
 
 Problem = tuple[np.ndarray, np.ndarray]
 

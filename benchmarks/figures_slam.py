@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nolbo_ppl.data.convert import Converted, convert_kitti_poles, convert_kitti_tracking, convert_ycbv_slam
+from nolbo_ppl.data.converters import Converted, convert_kitti_poles, convert_kitti_tracking, convert_ycbv_slam
 from nolbo_ppl.data.simulate import DetectorConfig, Drive, WorldConfig, simulate_drive
-from nolbo_ppl.data.trajectories import read_trajectory
 from nolbo_ppl.geometry.pose import inverse, relative, rotation_angle, se3_log
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online, solve_with_associations
-from nolbo_ppl.io import read_json, write_json
+from nolbo_ppl.io.files import read_json, write_json
+from nolbo_ppl.io.trajectories import read_trajectory
 from nolbo_ppl.metrics.association import association_pairs, normalised_error_squared
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align
 

@@ -16,10 +16,10 @@ from typing import Any, Literal
 
 import tyro
 
-from nolbo_ppl.data.drive import drive_preset, write_drive
-from nolbo_ppl.io import write_json
-from nolbo_ppl.mission.config import RunConfig
-from nolbo_ppl.mission.pipeline import run_mission
+from nolbo_ppl.io.files import write_json
+from nolbo_ppl.pipeline.mapping_pipeline import run_mission
+from nolbo_ppl.pipeline.run_config import RunConfig
+from nolbo_ppl.synthetic.worlds import drive_preset, write_drive
 
 UNSEEN = 91_000
 """Worlds are numbered from here: neither training nor the demonstration uses them."""

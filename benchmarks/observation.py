@@ -25,25 +25,25 @@ from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 from torch.nn.functional import logsigmoid
 
+from nolbo_ppl.cli.train import TrainConfig, run
 from nolbo_ppl.data.loader import render_batch
-from nolbo_ppl.data.scene_config import preset
-from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.data.supply import to_batch
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference import optimisation
+from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import INCLUSIVE
-from nolbo_ppl.inference.optimisation import OptimisationConfig
-from nolbo_ppl.inference.queries import ObservationModel
-from nolbo_ppl.inference.stages import Stage, StageRun
-from nolbo_ppl.inference.weights import load
-from nolbo_ppl.io import write_json
-from nolbo_ppl.models.config import PRESETS
+from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.io.files import write_json
 from nolbo_ppl.models.distributions import VonMisesMixture, WrappedNormal
 from nolbo_ppl.models.distributions.von_mises_kl import kl_wrapped_to_mixture
 from nolbo_ppl.models.distributions.wrapped_normal import kl_of_angles
-from nolbo_ppl.models.nolbo import Nolbo
-from nolbo_ppl.models.scene import SceneBatch
-from nolbo_ppl.train import TrainConfig, run
+from nolbo_ppl.models.model_config import PRESETS
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.training.scene_supply import to_batch
+from nolbo_ppl.training.stages import Stage, StageRun
 
 STEP_LIMIT, OBSERVE_LIMIT, WAITING_LIMIT = 1.10, 1.30, 0.05
 """What the figures may be at most."""

@@ -16,7 +16,7 @@ from pathlib import Path
 import tyro
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io import read_json
+from nolbo_ppl.io.files import read_json
 
 LIST = Path(__file__).with_suffix(".json")
 

@@ -16,8 +16,8 @@ import numpy as np
 import tyro
 
 from nolbo_ppl.data.simulate import DetectorConfig, Drive, simulate_drive
-from nolbo_ppl.data.trajectories import read_trajectory
 from nolbo_ppl.inference.slam import ObjectSlam, SlamConfig, SlamProblem, solve, solve_with_associations
+from nolbo_ppl.io.trajectories import read_trajectory
 
 
 @dataclass(frozen=True)

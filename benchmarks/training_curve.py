@@ -16,9 +16,9 @@ from typing import Any
 import tyro
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io import read_json, write_json
+from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.viz.style import grid, new_figure, save, styled
-from nolbo_ppl.viz.training import FIGURES, read_metrics
+from nolbo_ppl.viz.training_plots import FIGURES, read_metrics
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nolbo_ppl.citations import citation as citation
-    from nolbo_ppl.inference.observations import Observations as Observations
-    from nolbo_ppl.inference.queries import ObservationModel as ObservationModel
-    from nolbo_ppl.inference.weights import load as load
+    from nolbo_ppl.inference.posterior.model_folder import load as load
+    from nolbo_ppl.inference.posterior.predictor import ObservationModel as ObservationModel
+    from nolbo_ppl.structures.object_posteriors import Observations as Observations
 
-__version__ = "0.1.0"
+from nolbo_ppl import _moved
+from nolbo_ppl._version import __version__
+
+_moved.install()
 
 _LAZY = {
-    "load": "nolbo_ppl.inference.weights",
-    "ObservationModel": "nolbo_ppl.inference.queries",
-    "Observations": "nolbo_ppl.inference.observations",
+    "load": "nolbo_ppl.inference.posterior.model_folder",
+    "ObservationModel": "nolbo_ppl.inference.posterior.predictor",
+    "Observations": "nolbo_ppl.structures.object_posteriors",
     "citation": "nolbo_ppl.citations",
 }
 __all__ = ["ObservationModel", "Observations", "__version__", "citation", "load"]

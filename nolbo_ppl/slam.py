@@ -1,87 +1,22 @@
-"""`nolbo slam`: odometry and observations in, corrected trajectory and map of objects out."""
+"""Object SLAM under the name a roboticist types first: those of `nolbo_ppl.inference.slam`, lazily."""
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass, field
-from pathlib import Path
-
-import tyro
-
-from nolbo_ppl.data.observations import read_observations
-from nolbo_ppl.data.trajectories import poses_of_frames, read_covariance, read_trajectory
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
-from nolbo_ppl.inference.slam.export import write_result
+import importlib
+from typing import Any
 
 
-@dataclass(frozen=True)
-class SlamArguments:
-    """Correct a drifting trajectory by the objects seen along it, and map them with uncertainty."""
-
-    odometry: Path
-    """Odometry: KITTI (12 numbers a row) or TUM (`time x y z qx qy qz qw`), T_world_camera, x right, y down, z forward."""
-    observations: Path
-    """Observations: JSON Lines, one detection a line (see docs/slam.md)."""
-    out: Path
-    """Folder for trajectory.txt, landmarks.json, associations.jsonl, summary.json and map.png."""
-    odometry_covariance: Path | None = None
-    """Covariance of every odometry step: NPZ with `covariance` [n - 1, 6, 6], [rotation rad, translation m] at the later
-    camera."""
-    truth: Path | None = None
-    """True trajectory, for errors before and after: rows of the odometry, or TUM rows matched by time."""
-    model: str | None = None
-    """Model (a name or a folder) that decodes the landmarks' latents into landmarks_voxels.npz."""
-    online: bool = False
-    """Run keyframe by keyframe on iSAM2."""
-    config: SlamConfig = field(default_factory=SlamConfig)
-    """Settings."""
+def __getattr__(name: str) -> Any:
+    """The name in `nolbo_ppl.inference.slam`."""
+    return getattr(importlib.import_module("nolbo_ppl.inference.slam"), name)
 
 
-def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
-    """Read, solve, write; returns the result and the summary.
-
-    Raises:
-        NolboError: bad input, or a graph that cannot be solved; nothing half-written is left.
-    """
-    odometry = read_trajectory(arguments.odometry)
-    table = read_observations(arguments.observations, frames=len(odometry))
-    truth = None
-    if arguments.truth is not None:
-        truth = poses_of_frames(arguments.truth, len(odometry), odometry.times, of="the odometry")
-    covariance = None if arguments.odometry_covariance is None else read_covariance(arguments.odometry_covariance)
-    problem = SlamProblem(odometry.T_world_camera, table, covariance)
-    model = None
-    if arguments.model is not None:
-        from nolbo_ppl.inference.weights import load
-
-        model = load(arguments.model)  # before the solve: a wrong name should not cost a run
-    if arguments.online:
-        from nolbo_ppl.inference.slam.online import solve_online
-
-        result = solve_online(problem, arguments.config)
-    else:
-        result = solve(problem, arguments.config)
-    return result, write_result(arguments.out, result, odometry, truth, model=model)
-
-
-def describe(report: dict[str, object]) -> str:
-    """A few lines for the terminal."""
-    lines = [f"{report['frames']} frames, {report['observations']} observations, {report['landmarks']} landmarks, "
-             f"{report['loop_pairs']} loop pairs"]
-    before, after = report.get("before"), report.get("after")
-    if isinstance(before, dict) and isinstance(after, dict):
-        lines.append(f"ATE {before['ate']:.3f} m -> {after['ate']:.3f} m")
-    warnings = report["warnings"]
-    lines += [f"warning: {text}" for text in (warnings if isinstance(warnings, list) else [])]
-    return "\n".join(lines)
-
-
-def main(args: list[str] | None = None) -> None:
-    """Command line of `nolbo slam`."""
-    arguments = tyro.cli(SlamArguments, prog="nolbo slam", args=args)
-    _, report = run(arguments)
-    sys.stdout.write(describe(report) + f"\nwritten to {arguments.out}\n")
+def __dir__() -> list[str]:
+    """The public names."""
+    return list(importlib.import_module("nolbo_ppl.inference.slam").__all__)
 
 
 if __name__ == "__main__":
+    from nolbo_ppl.cli.slam import main
+
     main()

@@ -25,8 +25,9 @@ import numpy as np
 
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.inference.association import association_marginals
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, finish, init, plain_init, plain_solve, step
-from nolbo_ppl.inference.slam.plain import e_step
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, init, plain_init, plain_solve, step
+from nolbo_ppl.inference.slam import map_refinement as finish
+from nolbo_ppl.inference.slam.reference_em import e_step
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
 LAP = 80

@@ -33,11 +33,11 @@ from sklearn.metrics import silhouette_score
 from torch import nn
 
 import nolbo_ppl
-from nolbo_ppl.data.pool import ShapePool
-from nolbo_ppl.data.scene_config import preset
-from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.models.scene import unpack_bits
-from nolbo_ppl.viz.shape import draw_shape
+from nolbo_ppl.models.scene_batch import unpack_bits
+from nolbo_ppl.synthetic.assets.shape_library import ShapePool
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.viz.shape_plots import draw_shape
 from nolbo_ppl.viz.style import category_colour
 
 model = nolbo_ppl.load(os.environ.get("NOLBO_MODEL", "tiny"))

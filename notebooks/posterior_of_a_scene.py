@@ -33,14 +33,14 @@ import torch
 from scipy.stats import norm
 
 import nolbo_ppl
-from nolbo_ppl.data.scene_config import preset
-from nolbo_ppl.data.source import SceneSource
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.metrics.detection import match_image
-from nolbo_ppl.viz.observations import draw_observations
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 from nolbo_ppl.viz.panels import azimuth_density
-from nolbo_ppl.viz.shape import draw_shape, draw_uncertainty
+from nolbo_ppl.viz.posterior_plots import draw_observations
+from nolbo_ppl.viz.shape_plots import draw_shape, draw_uncertainty
 from nolbo_ppl.viz.style import category_colour
 
 model = nolbo_ppl.load(os.environ.get("NOLBO_MODEL", "tiny"))

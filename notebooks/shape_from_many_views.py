@@ -27,16 +27,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import nolbo_ppl
-from nolbo_ppl.data.backdrop import sample_backdrop, sample_light
-from nolbo_ppl.data.compose import camera_rotation
-from nolbo_ppl.data.materials import sample_materials
-from nolbo_ppl.data.pool import ShapePool
-from nolbo_ppl.data.scene import Scene, SceneObject, render_scene
-from nolbo_ppl.data.scene_config import preset
-from nolbo_ppl.data.view import Placed, View
 from nolbo_ppl.geometry.voxels import unpack_voxels, voxel_iou
-from nolbo_ppl.inference.slam.features import weighted_latents
-from nolbo_ppl.viz.shape import draw_shape, draw_uncertainty
+from nolbo_ppl.inference.slam.detection_features import weighted_latents
+from nolbo_ppl.synthetic.assets.shape_library import ShapePool
+from nolbo_ppl.synthetic.renderer.camera_view import Placed, View
+from nolbo_ppl.synthetic.renderer.materials import sample_materials
+from nolbo_ppl.synthetic.scenes.environment import sample_backdrop, sample_light
+from nolbo_ppl.synthetic.scenes.render_scene import Scene, SceneObject, render_scene
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_sampler import camera_rotation
+from nolbo_ppl.viz.shape_plots import draw_shape, draw_uncertainty
 from nolbo_ppl.viz.style import category_colour
 
 VIEWS = 10

@@ -27,13 +27,13 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from nolbo_ppl.data.observations import write_observations
+from nolbo_ppl.cli.slam import SlamArguments, run
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_drive
-from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.geometry.pose import make_pose
+from nolbo_ppl.io.observations import write_observations
+from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.metrics.association import association_pairs, normalised_error_squared
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align, path_length
-from nolbo_ppl.slam import SlamArguments, run
 
 TRUTH, VO, OWN, OBJECT = "black", "#9aa3ab", "#4e79a7", "#e15759"
 folder = Path(tempfile.mkdtemp(prefix="nolbo-"))

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from nolbo_ppl.inference.elbo import INCLUSIVE, INCLUSIVE_TERMS, PURE_BOUND, SceneElbo
 from nolbo_ppl.models.guide import ObservedScene
-from nolbo_ppl.models.nolbo import Nolbo
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.scene_batch import SceneBatch
 
 FORMS = ("mixture", "angle", "sincos")
 EVERYTHING = {**PURE_BOUND, **dict.fromkeys(INCLUSIVE_TERMS.values(), 1.0), **dict.fromkeys(INCLUSIVE, 1.0)}

@@ -20,8 +20,8 @@ from torch import Tensor
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 
 if TYPE_CHECKING:
-    from nolbo_ppl.inference.stages import StageRun
-    from nolbo_ppl.models.scene import SceneBatch
+    from nolbo_ppl.models.scene_batch import SceneBatch
+    from nolbo_ppl.training.stages import StageRun
 
 
 def part_of(rows: Tensor, rank: int | None, first: int) -> Tensor:
@@ -57,9 +57,9 @@ def normalisation(rank: int | None) -> dict[str, Tensor]:
 
 def training(rank: int | None) -> dict[str, Tensor]:
     """State after steps of shapes, then of scenes: frozen, then free and decoding."""
-    from nolbo_ppl.inference.optimisation import OptimisationConfig
-    from nolbo_ppl.inference.stages import Stage, StageRun, scene_weights
+    from nolbo_ppl.inference.svi import OptimisationConfig
     from nolbo_ppl.models.shape_vae import ShapeBatch
+    from nolbo_ppl.training.stages import Stage, StageRun, scene_weights
     from tests.factories import random_batch, tiny_config, tiny_model
 
     def scenes_of(step: int) -> SceneBatch:
@@ -92,8 +92,8 @@ def training(rank: int | None) -> dict[str, Tensor]:
 
 def local_run(seed: int) -> StageRun:
     """Scenes, three steps in all, averaged after every second one."""
-    from nolbo_ppl.inference.optimisation import OptimisationConfig
-    from nolbo_ppl.inference.stages import Stage, StageRun, scene_weights
+    from nolbo_ppl.inference.svi import OptimisationConfig
+    from nolbo_ppl.training.stages import Stage, StageRun, scene_weights
     from tests.factories import tiny_model
 
     quick = OptimisationConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
@@ -110,7 +110,7 @@ def local_batch(rank: int, step: int) -> SceneBatch:
 
 def local(rank: int) -> dict[str, Tensor]:
     """State of steps made alone, after the average of two and after the last average."""
-    from nolbo_ppl.inference.optimisation import state_tensors
+    from nolbo_ppl.inference.svi import state_tensors
 
     run, tensors = local_run(0), {}
     for step in range(3):

@@ -41,7 +41,7 @@ def commands(page: Path) -> list[str]:
             line = re.sub(r"^(\w+=\S+ )*(\.venv/bin/)?", "", line)
             if line.startswith("nolbo "):
                 found.append(line)
-            elif "-m nolbo_ppl." in line and "..." not in line:  # torchrun ... -m nolbo_ppl.train OPTIONS
+            elif "-m nolbo_ppl." in line and "..." not in line:  # torchrun ... -m nolbo_ppl.cli.train OPTIONS
                 found.append("nolbo " + line.split("-m nolbo_ppl.", 1)[1])
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     found += [line for line in INLINE.findall(text) if " --" in line and "..." not in line and "[" not in line]
@@ -70,7 +70,7 @@ def test_every_command_line_is_understood(page: Path, capsys: pytest.CaptureFixt
     for line in commands(page):
         verb, *arguments = shlex.split(line)[1:]
         assert verb in VERBS, f"{line!r}: no such verb"
-        module = import_module(f"nolbo_ppl.{verb}")
+        module = import_module(f"nolbo_ppl.cli.{verb}")
         if any(word.isupper() or word == "..." for word in arguments if not word.startswith("-")):
             arguments = ["1" if word.isupper() else word for word in arguments]  # --seed N, --out DIR
         try:
@@ -86,24 +86,24 @@ def test_every_command_line_is_understood(page: Path, capsys: pytest.CaptureFixt
 
 def test_the_parser_would_refuse_a_wrong_option(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        import_module("nolbo_ppl.observe").main(["--images", "a", "--out", "b", "--no-such-option", "1"])
+        import_module("nolbo_ppl.cli.observe").main(["--images", "a", "--out", "b", "--no-such-option", "1"])
     assert "no-such-option" in capsys.readouterr().err
 
 
 LONG = ("run(kitchen)",)
 """Blocks that take minutes: tests of their own run them on less."""
 SCENES = """
-from nolbo_ppl.data.dataset import write_scenes
-from nolbo_ppl.data.scene_config import preset
-from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.synthetic.dataset_writer import write_scenes
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 write_scenes("scenes", SceneSource(preset("easy"), seed=5), 2)
 """
 SEEN = """
 import nolbo_ppl
 from pathlib import Path
 from PIL import Image
-from nolbo_ppl.data.scene_config import preset
-from nolbo_ppl.data.source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 source, shipped = SceneSource(preset("easy"), seed=5), nolbo_ppl.load("tiny")
 image = next(image for image in (source.render(i).image for i in range(50)) if len(shipped.observe(image, decode=False)))
 Path("scenes/images").mkdir(parents=True)

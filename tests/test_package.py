@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import graphlib
+import importlib
 import importlib.metadata
 import os
 import re
@@ -13,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import nolbo_ppl
+from nolbo_ppl._moved import MOVED
 from nolbo_ppl.citations import REFERENCES
 from nolbo_ppl.errors import InputError
 
@@ -20,20 +23,25 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "nolbo_ppl"
 
 LAYERS = (
-    ("errors", "io", "categories", "citations"),
-    ("geometry", "metrics"),
+    ("errors", "_version", "_moved", "categories", "citations", "parallel"),
+    ("geometry",),
+    ("structures",),
+    ("io",),
+    ("metrics",),
     ("models",),
     ("inference",),
-    ("data", "viz"),
-    ("inference.slam",),
-    ("mission",),
-    (
-        "scenes", "train", "curves", "evaluate", "observe", "convert", "slam", "demo", "drive", "odometry", "run", "report",
-        "view",
-    ),
+    ("odometry",),
+    ("synthetic",),
+    ("data",),
+    ("training",),
+    ("evaluation",),
+    ("viz",),
+    ("report",),
+    ("pipeline",),
     ("cli",),
+    ("train", "slam", "__main__"),
 )
-"""From the bottom up: a module imports from its own layer and those before it. SLAM reads the tables of `data`."""
+"""From the bottom up: a module imports from its own room and those before it, wherever the import stands in it."""
 
 
 def layer_of(module: str) -> int:
@@ -44,21 +52,15 @@ def layer_of(module: str) -> int:
 
 
 def imported(path: Path) -> set[str]:
-    """Modules of the package that a file imports when it is loaded."""
+    """Modules of the package that a file imports: at its top, within functions, for types alone."""
     found: set[str] = set()
-
-    def visit(node: ast.AST) -> None:
-        for child in ast.iter_child_nodes(node):
-            typing_only = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test)
-            if typing_only or isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
-                continue
-            if isinstance(child, ast.ImportFrom) and child.module and child.module.startswith("nolbo_ppl."):
-                found.add(child.module)
-            if isinstance(child, ast.Import):
-                found.update(alias.name for alias in child.names if alias.name.startswith("nolbo_ppl."))
-            visit(child)
-
-    visit(ast.parse(path.read_text(encoding="utf-8")))
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module == "nolbo_ppl":
+            found.update(f"nolbo_ppl.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("nolbo_ppl."):
+            found.add(node.module)
+        elif isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names if alias.name.startswith("nolbo_ppl."))
     return found
 
 
@@ -74,8 +76,55 @@ def test_imports_run_downwards(path: Path) -> None:
 
 
 def test_the_check_of_imports_sees_an_import() -> None:
-    assert "nolbo_ppl.models.nolbo" in imported(PACKAGE / "train.py")
-    assert layer_of("nolbo_ppl.train") > layer_of("nolbo_ppl.models.nolbo")
+    assert "nolbo_ppl.models.observation_model" in imported(PACKAGE / "training" / "trainer.py")
+    assert layer_of("nolbo_ppl.cli.train") > layer_of("nolbo_ppl.models.observation_model")
+
+
+def module_of(path: Path) -> str:
+    """Dotted name of a file of the package."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(("nolbo_ppl", *(part for part in parts if part != "__init__")))
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    known = {module_of(path) for path in modules()}
+    packages = {module_of(path) for path in modules() if path.name == "__init__.py"}
+    graph = {module_of(path): (imported(path) & known) - packages for path in modules()}
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_file_names_stand_once() -> None:
+    counts: dict[str, list[str]] = {}
+    for path in modules():
+        if not path.stem.startswith("__") and path.parent.name != "cli":  # a verb may be named like a room's module
+            counts.setdefault(path.stem, []).append(str(path.relative_to(PACKAGE)))
+    assert not {name: places for name, places in counts.items() if len(places) > 1}
+
+
+def test_no_room_holds_more_than_a_quarter_of_the_code() -> None:
+    lines: dict[str, int] = {}
+    for path in modules():
+        room = path.relative_to(PACKAGE).parts[0]
+        lines[room] = lines.get(room, 0) + len(path.read_text(encoding="utf-8").splitlines())
+    assert max(lines.values()) <= 0.25 * sum(lines.values()), lines
+
+
+@pytest.mark.parametrize("old", sorted(MOVED))
+def test_import_paths_of_the_first_version_name_the_new_module(old: str) -> None:
+    new = importlib.import_module(f"nolbo_ppl.{MOVED[old]}")
+    specification = new.__spec__
+    with pytest.warns(FutureWarning, match=re.escape(f"nolbo_ppl.{old} moved to nolbo_ppl.{MOVED[old]}")):
+        sys.modules.pop(f"nolbo_ppl.{old}", None)
+        assert importlib.import_module(f"nolbo_ppl.{old}") is new
+    assert new.__spec__ is specification
+
+
+def test_names_of_a_module_that_became_a_room_are_found() -> None:
+    with pytest.warns(FutureWarning, match=r"nolbo_ppl.io.write_json moved to nolbo_ppl.io.files"):
+        from nolbo_ppl.io import write_json
+    assert write_json.__module__ == "nolbo_ppl.io.files"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = importlib.import_module("nolbo_ppl.io").nothing
 
 
 def test_importing_the_package_is_light() -> None:

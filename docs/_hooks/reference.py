@@ -25,7 +25,7 @@ def modules_of(package: Path) -> list[str]:
     dotted = ".".join(package.relative_to(ROOT).parts)
     names = [f"{dotted}.{path.stem}" for path in sorted(package.glob("*.py")) if not path.stem.startswith("_")]
     if package == PACKAGE:
-        names = [name for name in names if name.split(".")[-1] not in {*verbs(), "cli"}]
+        names = [name for name in names if name.split(".")[-1] not in {"train", "slam"}]
     return names
 
 
@@ -48,7 +48,7 @@ def command_page() -> str:
     parts = [
         "# Commands",
         "`nolbo VERB [options]`. Every option is also a field of the verb's dataclass, so that a command can be called from "
-        "Python: `nolbo_ppl.VERB` holds the dataclass and `run`.",
+        "Python: `nolbo_ppl.cli.VERB` holds the dataclass and `run`.",
     ]
     for verb, about in verbs().items():
         parts += [f"## nolbo {verb}", about[:1].upper() + about[1:] + ".", f"```text\n{help_of(verb)}\n```"]
@@ -61,7 +61,7 @@ def help_of(verb: str) -> str:
     import io
     import os
 
-    main = importlib.import_module(f"nolbo_ppl.{verb}").main
+    main = importlib.import_module(f"nolbo_ppl.cli.{verb}").main
     out, columns = io.StringIO(), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
     try:

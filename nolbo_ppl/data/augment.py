@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.scene_batch import SceneBatch
 
 
 @dataclass(frozen=True)

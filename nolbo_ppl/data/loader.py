@@ -11,11 +11,11 @@ from typing import Protocol, TypeVar
 import numpy as np
 from jaxtyping import Int
 
-from nolbo_ppl.data.arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
-from nolbo_ppl.data.pool import VOXELS
-from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.data.workers import parallel
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.parallel import parallel
+from nolbo_ppl.synthetic.assets.shape_library import VOXELS
+from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.scene_batch import SceneBatch
 
 
 def mirror_voxels(packed: UInt8[Tensor, "*n bytes"]) -> UInt8[Tensor, "*n bytes"]:
@@ -31,7 +31,7 @@ def mirror(batch: SceneBatch, chosen: Bool[Tensor, " b"]) -> SceneBatch:
     """The batch with the chosen scenes mirrored. Their instance labels are -1: mirrored instances have none.
 
     Latents of the shape autoencoder are left as they are: they must be those of the mirrored voxels
-    (`nolbo_ppl.data.supply.ShapeTable.add_teacher`).
+    (`nolbo_ppl.training.scene_supply.ShapeTable.add_teacher`).
     """
     width = batch.image.shape[-1]
     fx, fy, cx, cy = batch.intrinsics.unbind(-1)

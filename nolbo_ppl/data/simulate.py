@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.data.observations import ObservationTable, make_table
 from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
+from nolbo_ppl.io.observations import ObservationTable, make_table
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.models.config import ModelConfig
+from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 
 

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.models.backbones import check_image, make_encoder, normalise_image
-from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.distributions import (
     NoisyNormal,
     ViewpointMixture,
@@ -24,8 +23,9 @@ from nolbo_ppl.models.distributions import (
 )
 from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.head import RegionHead, RegionParameters
+from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.prior import LabelPrior
-from nolbo_ppl.models.scene import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
+from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
 
 
 @dataclass

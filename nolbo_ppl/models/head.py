@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nolbo_ppl.models.config import ModelConfig
-from nolbo_ppl.models.glimpse import Glimpse
 from nolbo_ppl.models.layers import OutputLinear
-from nolbo_ppl.models.scene import decode_box, encode_box
-from nolbo_ppl.models.shape import bounded_exp
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.roi_refinement import Glimpse
+from nolbo_ppl.models.scene_batch import decode_box, encode_box
+from nolbo_ppl.models.shape_networks import bounded_exp
 
 
 @dataclass

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nolbo_ppl.models.config import ModelConfig
-from nolbo_ppl.models.scene import SceneBatch
-from nolbo_ppl.models.shape import PriorNetwork
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.models.shape_networks import PriorNetwork
 
 
 class LabelPrior(nn.Module):

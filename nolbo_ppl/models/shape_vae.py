@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from nolbo_ppl.models.config import ModelConfig
 from nolbo_ppl.models.distributions import NoisyNormal
-from nolbo_ppl.models.scene import unpack_bits
-from nolbo_ppl.models.shape import VoxelEncoder
-from nolbo_ppl.models.story import Story, voxel_site
+from nolbo_ppl.models.generative import Story, voxel_site
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.scene_batch import unpack_bits
+from nolbo_ppl.models.shape_networks import VoxelEncoder
 
 
 @dataclass

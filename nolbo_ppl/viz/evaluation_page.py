@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from nolbo_ppl.io import atomic_path
+from nolbo_ppl.io.files import atomic_path
 
 CAPTIONS = {
     "precision_recall": "Precision against recall: every detection by its objectness (left), each category by its own score.",
@@ -71,7 +71,7 @@ def write_page(values: Mapping[str, Any], pictures: Sequence[Path], path: str | 
     """Write the page.
 
     Args:
-        values: the content of metrics.json (`nolbo_ppl.evaluate.metrics`).
+        values: the content of metrics.json (`nolbo_ppl.cli.evaluate.metrics`).
         pictures: PNG files, put into the page itself.
         path: where it goes.
     """

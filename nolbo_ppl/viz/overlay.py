@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nolbo_ppl.inference.observations import Observations
+from nolbo_ppl.structures.object_posteriors import Observations
 from nolbo_ppl.viz.style import AXIS_COLOURS, category_colour, plain
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.inference.observations import Observations
+from nolbo_ppl.structures.object_posteriors import Observations
 from nolbo_ppl.viz.overlay import bearing_range_ellipse
 from nolbo_ppl.viz.style import INK, MUTED, category_colour, grid, plain
 

@@ -8,7 +8,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.io import atomic_path
+from nolbo_ppl.io.files import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

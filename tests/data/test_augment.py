@@ -11,7 +11,7 @@ import torch
 from nolbo_ppl.data.augment import Augmentation, augment
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.scene_batch import SceneBatch
 
 STILL = Augmentation(
     geometric_probability=0.0, brightness=0.0, contrast=(1.0, 1.0), saturation=(1.0, 1.0), hue=0.0,

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nolbo_ppl.data import cache
-from nolbo_ppl.data.arrays import Arrays
-from nolbo_ppl.data.cache import CachedScenes, cache_key, write_cache
+from nolbo_ppl.data import scene_cache as cache
 from nolbo_ppl.data.loader import batch_indices, prefetch, render_batch, shuffled_batches, streamed_batches
-from nolbo_ppl.data.scene_config import easy, standard
-from nolbo_ppl.data.source import SceneSource
-from nolbo_ppl.data.supply import Joined
-from nolbo_ppl.data.workers import parallel
+from nolbo_ppl.data.scene_cache import CachedScenes, cache_key, write_cache
 from nolbo_ppl.errors import InputError
+from nolbo_ppl.parallel import parallel
+from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
+from nolbo_ppl.synthetic.scenes.scene_config import easy, standard
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.training.scene_supply import Joined
 
 FIELDS = {
     "image", "intrinsics", "present", "box", "category", "instance", "viewpoint", "has_viewpoint", "symmetry",

@@ -8,11 +8,11 @@ import torch
 
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.mirror import mirror, mirror_voxels
-from nolbo_ppl.data.supply import SceneSupply, ShapeTable
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels
+from nolbo_ppl.training.scene_supply import SceneSupply, ShapeTable
 from tests.factories import random_batch, tiny_config, tiny_model
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from nolbo_ppl.data.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import chain, make_pose, se3_exp, so3_exp
+from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align, path_length, relative_pose_error, umeyama
 
 

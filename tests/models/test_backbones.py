@@ -7,11 +7,11 @@ import torch
 from torch import nn
 
 from nolbo_ppl.models.backbones import Darknet19Encoder, TinyEncoder
-from nolbo_ppl.models.config import paper
 from nolbo_ppl.models.guide import Guide
+from nolbo_ppl.models.model_config import paper
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 from nolbo_ppl.models.prior import LabelPrior
-from nolbo_ppl.models.shape import VoxelDecoder
+from nolbo_ppl.models.shape_networks import VoxelDecoder
 from tests.factories import tiny_config
 
 YOLO9000_TABLE_6 = [32, "M", 64, "M", 128, (64,), 128, "M", 256, (128,), 256, "M", 512, (256,), 512, (256,), 512, "M",

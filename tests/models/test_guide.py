@@ -10,7 +10,7 @@ import torch
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.models.guide import assign_predictors, orientation_posterior
-from nolbo_ppl.models.scene import cell_of, decode_box
+from nolbo_ppl.models.scene_batch import cell_of, decode_box
 from tests.factories import instance_config, random_batch, random_posterior, tiny_config, tiny_model
 
 

@@ -7,7 +7,7 @@ import torch
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import voxel_centres
-from nolbo_ppl.inference.observations import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.inference.measure import SceneTruth
+from nolbo_ppl.evaluation.measure import SceneTruth
+from nolbo_ppl.evaluation.retrieval import RetrievalRecords
 from nolbo_ppl.metrics.detection import match
-from nolbo_ppl.metrics.retrieval import RetrievalRecords
-from nolbo_ppl.viz.detections import choose_scenes, mistakes, write_detections
-from nolbo_ppl.viz.evaluation import draw_retrieval
+from nolbo_ppl.viz.detection_plots import choose_scenes, mistakes, write_detections
 from nolbo_ppl.viz.evaluation_page import LARGE, WORDS, write_page
+from nolbo_ppl.viz.evaluation_plots import draw_retrieval
 from nolbo_ppl.viz.style import save
 
 
@@ -138,7 +138,7 @@ def test_the_page_holds_everything_and_needs_nothing(tmp_path):
 
 
 def test_every_figure_has_words():
-    from nolbo_ppl.metrics.figures import REQUIRED
+    from nolbo_ppl.evaluation.scores import REQUIRED
 
     assert set(REQUIRED) <= set(WORDS)
 

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.viz.training import draw_training, read_metrics
+from nolbo_ppl.viz.training_plots import draw_training, read_metrics
 
 
 def write(path, rows):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.em import StepInfo, step
-from nolbo_ppl.inference.slam.finish import finish
 from nolbo_ppl.inference.slam.graph import GraphError, Links
-from nolbo_ppl.inference.slam.noise import estimate_noise
-from nolbo_ppl.inference.slam.observe import Associations
-from nolbo_ppl.inference.slam.online import ObjectSlam, OnlineInfo, solve_online
-from nolbo_ppl.inference.slam.oracle import solve_with_associations
-from nolbo_ppl.inference.slam.plain import PlainInfo, PlainState, plain_init, plain_solve, plain_step
-from nolbo_ppl.inference.slam.result import Landmark, SlamResult
+from nolbo_ppl.inference.slam.ground_truth_association import solve_with_associations
+from nolbo_ppl.inference.slam.incremental.online_slam import ObjectSlam, OnlineInfo, solve_online
+from nolbo_ppl.inference.slam.initialise import SlamState, init
+from nolbo_ppl.inference.slam.map_refinement import finish
+from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
+from nolbo_ppl.inference.slam.reference_em import PlainInfo, PlainState, plain_init, plain_solve, plain_step
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import iterate, solve
-from nolbo_ppl.inference.slam.state import SlamState, init
-from nolbo_ppl.inference.slam.tracklets import Tracklets
+from nolbo_ppl.inference.slam.tracking import Tracklets
+from nolbo_ppl.structures.landmark import Landmark
 
 __all__ = [
     "Associations",

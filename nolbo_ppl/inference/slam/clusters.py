@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from nolbo_ppl.inference.slam.graph import Links
-from nolbo_ppl.inference.slam.state_types import SlamState
+from nolbo_ppl.inference.slam.slam_state import SlamState
 
 
 def frames_of_landmarks(state: SlamState) -> list[frozenset[int]]:

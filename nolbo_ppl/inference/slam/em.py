@@ -2,7 +2,7 @@
 
 This is the working form that closes loops: relative covariances from the graph itself, inflated in the first rounds,
 links under a Cauchy kernel. It is not exact coordinate ascent on the bound of the plain EM
-(`nolbo_ppl.inference.slam.plain`), which never falls but closes no loop after drift; its log evidence is reported for
+(`nolbo_ppl.inference.slam.reference_em`), which never falls but closes no loop after drift; its log evidence is reported for
 each iteration with what changed.
 """
 
@@ -16,14 +16,14 @@ from jaxtyping import Float, Int
 from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.clusters import clusters_of
-from nolbo_ppl.inference.slam.config import SlamConfig
-from nolbo_ppl.inference.slam.constellation import close_constellations
-from nolbo_ppl.inference.slam.evidence import Pairs, TrackletFeatures, candidate_pairs, posterior_samples
+from nolbo_ppl.inference.slam.consistent_cliques import close_constellations
 from nolbo_ppl.inference.slam.graph import LOOSE_ROTATION, Links, add_links, linearise, optimise
-from nolbo_ppl.inference.slam.odometry import refine_odometry
+from nolbo_ppl.inference.slam.initialise import base_graph, inlier_weights
+from nolbo_ppl.inference.slam.loop_candidates import Pairs, TrackletFeatures, candidate_pairs, posterior_samples
+from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
 from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation
-from nolbo_ppl.inference.slam.state import base_graph, inlier_weights
-from nolbo_ppl.inference.slam.state_types import SlamState
+from nolbo_ppl.inference.slam.slam_problem import SlamConfig
+from nolbo_ppl.inference.slam.slam_state import SlamState
 
 LINK_ROTATION = 0.05
 """Scale of the rotation between two linked landmarks that are oriented, rad."""

@@ -17,8 +17,8 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.geometry.pose import make_pose, relative
-from nolbo_ppl.inference.slam.config import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.orientation import observed_modes, resolve_modes, resolved_symmetry
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
 LOOSE_ROTATION = 10.0
 """Scale of a rotation nobody observed, rad."""

@@ -13,9 +13,9 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.data.observations import ObservationTable
 from nolbo_ppl.geometry.pose import so3_exp, so3_log
-from nolbo_ppl.inference.slam.config import SlamConfig
+from nolbo_ppl.inference.slam.slam_problem import SlamConfig
+from nolbo_ppl.io.observations import ObservationTable
 
 UNIFORM_LOG_DENSITY = -np.log(8.0 * np.pi**2)
 """Log density of the uniform distribution on SO(3) with respect to rotation vectors at the identity, rad^-3."""

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from nolbo_ppl.inference.slam.config import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.em import StepInfo, step
-from nolbo_ppl.inference.slam.finish import finish
-from nolbo_ppl.inference.slam.result import SlamResult
-from nolbo_ppl.inference.slam.state import SlamState, first_estimate, init
+from nolbo_ppl.inference.slam.initialise import SlamState, first_estimate, init
+from nolbo_ppl.inference.slam.map_refinement import finish
+from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.slam_result import SlamResult
 
 
 def iterate(

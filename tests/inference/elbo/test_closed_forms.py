@@ -19,8 +19,8 @@ from nolbo_ppl.inference.elbo import (
     SceneElbo,
 )
 from nolbo_ppl.models.guide import ObservedScene
-from nolbo_ppl.models.nolbo import Nolbo
-from nolbo_ppl.models.scene import unpack_bits
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.scene_batch import unpack_bits
 from tests.bound_cases import FORMS, terms_of, unsymmetric
 from tests.factories import (
     assert_within,

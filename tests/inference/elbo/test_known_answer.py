@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nolbo_ppl.inference import optimisation
+from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import (
     PURE_BOUND,
     ElboResult,
     SceneElbo,
 )
-from nolbo_ppl.models.story import conjugate_truth, expected_normal_log_prob
+from nolbo_ppl.models.generative import conjugate_truth, expected_normal_log_prob
 from tests.factories import (
     assert_within,
 )

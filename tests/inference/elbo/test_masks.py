@@ -12,7 +12,7 @@ from nolbo_ppl.inference.elbo import (
     SceneElbo,
     SceneLoss,
 )
-from nolbo_ppl.models.scene import SceneBatch
+from nolbo_ppl.models.scene_batch import SceneBatch
 from tests.bound_cases import EVERYTHING, FORMS, terms_of
 from tests.factories import (
     instance_config,

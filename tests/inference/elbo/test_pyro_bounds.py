@@ -11,7 +11,7 @@ from pyro.infer import Trace_ELBO, TraceEnum_ELBO, TraceMeanField_ELBO
 from torch import Tensor
 
 from nolbo_ppl.models.guide import ObservedScene
-from nolbo_ppl.models.nolbo import Nolbo
+from nolbo_ppl.models.observation_model import Nolbo
 from tests.bound_cases import FORMS, terms_of, unsymmetric
 from tests.factories import (
     assert_within,

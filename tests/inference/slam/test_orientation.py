@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nolbo_ppl.data.observations import make_table
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.geometry.pose import make_pose, rotation_angle, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.inference.slam.graph import Estimate, add_observation_factors, resolve_observations, to_values
-from nolbo_ppl.inference.slam.noise import estimate_noise
+from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.orientation import (
     RotationModes,
     mixture_log_density,
@@ -22,6 +21,7 @@ from nolbo_ppl.inference.slam.orientation import (
     resolve_modes,
     vertical_turns,
 )
+from nolbo_ppl.io.observations import make_table
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
 Z = np.array([0.0, 0.0, 1.0])

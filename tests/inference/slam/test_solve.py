@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.observations import ObservationTable, concatenate, make_table
 from nolbo_ppl.data.simulate import DetectorConfig, Drive, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse, transform
@@ -21,6 +20,7 @@ from nolbo_ppl.inference.slam import (
     solve_with_associations,
     step,
 )
+from nolbo_ppl.io.observations import ObservationTable, concatenate, make_table
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
@@ -91,8 +91,8 @@ def test_answers_carry_uncertainty(solved: tuple[Drive, SlamResult]) -> None:
 def test_covariances_equal_gtsam_marginals(solved: tuple[Drive, SlamResult]) -> None:
     import gtsam
 
-    from nolbo_ppl.inference.slam.finish import final_graph
     from nolbo_ppl.inference.slam.graph import landmark_key, pose_key, to_values
+    from nolbo_ppl.inference.slam.map_refinement import final_graph
 
     _, result = solved
     marginals = gtsam.Marginals(final_graph(result.state), to_values(result.state.estimate))

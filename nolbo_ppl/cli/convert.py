@@ -1,0 +1,147 @@
+"""`nolbo convert`: public data sets into odometry, truth and observations for `nolbo slam`, or scenes for `nolbo evaluate`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from nolbo_ppl.data.converters import (
+    Converted,
+    convert_kitti_object,
+    convert_kitti_poles,
+    convert_kitti_tracking,
+    convert_ycbv_slam,
+    write_converted,
+)
+
+
+@dataclass(frozen=True)
+class KittiObject:
+    """KITTI object detection: street images with 3D boxes of cars, as scenes for `nolbo evaluate`."""
+
+    data: Path
+    """Folder `kitti_object` with image_2/, label_2/ and calib/."""
+    out: Path
+    """Folder for images/, scenes.jsonl, source.json."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        counts = convert_kitti_object(self.data, self.out)
+        return f"{counts['images']} images, {counts['objects']} cars, {counts['ignore']} regions to ignore"
+
+
+@dataclass(frozen=True)
+class KittiPoles:
+    """KITTI odometry with simulated detections of the real pole map."""
+
+    data: Path
+    """Folder `kitti_odometry` with poses/, poles/ and odometry."""
+    sequence: str
+    """Two digits."""
+    out: Path
+    """Folder for odometry.txt, truth.txt, observations.jsonl, objects.json, source.json."""
+    odometry: str = "odometry_f2f"
+    """Folder of the odometry."""
+    every: int = 1
+    """Keep every this many frames."""
+    seed: int = 0
+    """Seed of the detections."""
+    position_scale: float = 0.1
+    """Noise of a position at range 0, m."""
+    position_ratio: float = 0.03
+    """Its growth with range, m per m."""
+    miss_rate: float = 0.15
+    """Probability that a pole in view is missed."""
+    clutter_rate: float = 0.5
+    """Mean false detections a frame."""
+    maximum_range: float = 30.0
+    """m."""
+
+    def convert(self) -> Converted:
+        """Run it."""
+        return convert_kitti_poles(
+            self.data, self.sequence, odometry=self.odometry, every=self.every, seed=self.seed,
+            position_scale=self.position_scale, position_ratio=self.position_ratio, miss_rate=self.miss_rate,
+            clutter_rate=self.clutter_rate, maximum_range=self.maximum_range)
+
+
+@dataclass(frozen=True)
+class KittiTracking:
+    """KITTI tracking: real car detections, rebuilt ego motion with added drift."""
+
+    data: Path
+    """Folder `kitti_tracking` with labels/, detections_car/ and pseudo_ego/."""
+    sequence: str
+    """Four digits."""
+    out: Path
+    """Folder for odometry.txt, truth.txt, observations.jsonl, objects.json, source.json."""
+    seed: int = 0
+    """Seed of the drift."""
+    rotation_drift: float = float(np.deg2rad(0.3))
+    """Heading error of one frame, rad."""
+    translation_drift: float = 0.02
+    """Position error of one frame, m per m."""
+    minimum_score: float = 0.0
+    """Detections below are left out."""
+
+    def convert(self) -> Converted:
+        """Run it."""
+        return convert_kitti_tracking(self.data, self.sequence, seed=self.seed, rotation_drift=self.rotation_drift,
+                                      translation_drift=self.translation_drift, minimum_score=self.minimum_score)
+
+
+@dataclass(frozen=True)
+class YcbvSlam:
+    """YCB-Video SLAM: real 6D detections with heavy tails, real odometry with added drift."""
+
+    data: Path
+    """Folder `ycbv_slam` of NPZ files."""
+    sequence: str
+    """Four digits."""
+    out: Path
+    """Folder for odometry.txt, truth.txt, observations.jsonl, objects.json, source.json."""
+    detections: str = "det_initial"
+    """det_initial, det_selftrained or det_supervised."""
+    every: int = 10
+    """Keep every this many frames."""
+    seed: int = 0
+    """Seed of the drift."""
+    rotation_drift: float = float(np.deg2rad(1.0))
+    """Error of each angle of one step, rad."""
+    translation_drift: float = 0.005
+    """Error of each coordinate of one step, m."""
+
+    def convert(self) -> Converted:
+        """Run it."""
+        return convert_ycbv_slam(self.data, self.sequence, detections=self.detections, every=self.every, seed=self.seed,
+                                 rotation_drift=self.rotation_drift, translation_drift=self.translation_drift)
+
+
+Source = (
+    Annotated[KittiObject, tyro.conf.subcommand("kitti-object")]
+    | Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
+    | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
+    | Annotated[YcbvSlam, tyro.conf.subcommand("ycbv-slam")]
+)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Command line of `nolbo convert`."""
+    source: KittiObject | KittiPoles | KittiTracking | YcbvSlam
+    source = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
+    if isinstance(source, KittiObject):
+        written = source.write()
+    else:
+        data = source.convert()
+        write_converted(source.out, data)
+        written = f"{len(data.odometry)} frames, {len(data.observations)} observations"
+    sys.stdout.write(f"{written} written to {source.out}\n")
+
+
+if __name__ == "__main__":
+    main()

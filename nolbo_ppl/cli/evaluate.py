@@ -1,0 +1,275 @@
+"""`nolbo evaluate`: figures of an observation model on unseen scenes, with intervals, plots and examples."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from nolbo_ppl._version import __version__
+from nolbo_ppl.data.dataset_folder import SceneFolder
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.evaluation.instance_views import InstanceViews
+from nolbo_ppl.evaluation.labelled_scenes import FolderScenes, GeneratedScenes, Scenes
+from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
+from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords, concatenate
+from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
+from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, figures
+from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.posterior.multiscale import Pyramid
+from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.io.files import write_json
+from nolbo_ppl.metrics.intervals import Estimate
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+
+SEED = 9001
+"""Default seed of generated scenes: neither the scenes nor the shapes of another seed are among them."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Evaluate a model on scenes it has not seen and write figures, plots and examples."""
+
+    out: Path
+    """Folder for metrics.json and the pictures."""
+    model: str = "tiny"
+    """Name of shipped weights, or a folder with model.safetensors and config.json."""
+    scenes: Path | None = None
+    """Folder of labelled scenes (scenes.jsonl); without it scenes are generated."""
+    count: int = 500
+    """Scenes to generate, or at most to read."""
+    seed: int = SEED
+    """Seed of the generated scenes and their shapes."""
+    difficulty: Literal["easy", "standard", "full"] = "standard"
+    """Generated scenes: easy, standard or full."""
+    cad: Path | None = None
+    """Folder of CAD shapes to generate scenes from, in place of parametric ones."""
+    backgrounds: Path | None = None
+    """Folder of photographs behind generated scenes."""
+    sizes: tuple[int, ...] = ()
+    """Longer sides, px, images are brought to; the network's own size by default. With several, each answers for the
+    objects it shows at a trained size: `256 640` for street images 1242 px wide."""
+    retrieval: bool = False
+    """Measure too whether the shape latent tells instances of a category apart, from other views in other light."""
+    gallery: int = 100
+    """Instances of each category among which one is to be found again."""
+    least_side: float = 12.0
+    """Objects whose box has no side of so many px do not count, nor does a detection of them."""
+    least_visibility: float = 0.5
+    """Objects of which less is seen do not count either."""
+    threshold: float = 0.01
+    """Least objectness of a detection."""
+    resamples: int = 500
+    """Bootstrap resamples of the scenes behind the intervals."""
+    batch: int = 32
+    """Scenes that go through the network at once."""
+    pictures: bool = True
+    """Draw plots and examples, and put them with every figure into index.html."""
+
+
+def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
+    """The scenes the configuration asks for: those of a folder, or generated ones.
+
+    Raises:
+        InputError: there are none, or both a folder and shapes or photographs to generate from are given.
+    """
+    if config.count < 1:
+        raise input_error("number of scenes", got=config.count, expected="at least 1")
+    categories = model_config.categories
+    if config.scenes is not None:
+        if config.cad is not None or config.backgrounds is not None:
+            raise input_error("a folder of scenes and what to generate others from", do="drop --cad, --backgrounds")
+        folder = SceneFolder(config.scenes, categories, size=model_config.image_size, symmetry=model_config.symmetry)
+        return FolderScenes(folder, config.count)
+    return GeneratedScenes(open_source(config, model_config), config.count, categories)
+
+
+def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSource:
+    """Where generated scenes and views of instances come from."""
+    cad = None
+    if config.cad is not None:
+        from nolbo_ppl.synthetic.assets.cad import load_cad_folder
+
+        cad = tuple(load_cad_folder(config.cad, model_config.categories))
+    return SceneSource(
+        preset(config.difficulty, rendered_size(model_config.image_size)), seed=config.seed, cad=cad,
+        backgrounds=None if config.backgrounds is None else str(config.backgrounds),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything measured."""
+
+    objects: ObjectRecords
+    detections: DetectionRecords
+    figures: dict[str, Estimate]
+    scenes: int
+    categories: tuple[str, ...]
+    retrieval: RetrievalRecords | None = None
+    """Instances found again, where that was asked for."""
+
+
+def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: Scenes) -> Evaluation:
+    """Run the model over the scenes and compute every figure.
+
+    Raises:
+        InputError: no scene holds an object that counts.
+    """
+    objects: list[ObjectRecords] = []
+    boxes, labels, counts, answers, regions = [], [], [], [], []
+    for start in tqdm(range(0, len(scenes), config.batch), desc="evaluating", unit="batch", disable=None):
+        rows = range(start, min(start + config.batch, len(scenes)))
+        truth = [scenes[i] for i in rows]
+        images, cameras = [scene.image for scene in truth], np.array([scene.intrinsics for scene in truth])
+        found = model.observe(images, cameras, threshold=config.threshold, decode=False, batch=config.batch)
+        answers += [(one.box, one.objectness, one.class_posterior) for one in found]
+        counted = [scene.counts(config.least_side, config.least_visibility) for scene in truth]
+        boxes += [scene.box for scene in truth]
+        labels += [scene.category for scene in truth]
+        counts += counted
+        regions += [scene.ignore for scene in truth]
+        used = [k for k, some in enumerate(counted) if some.any()]
+        if used:
+            slots = [np.flatnonzero(counted[k]) for k in used]
+            at_boxes = model.observe_boxes(
+                [images[k] for k in used], cameras[used], [truth[k].box[s] for k, s in zip(used, slots)],
+                decode=False, batch=config.batch,
+            )  # fmt: skip
+            objects.append(measure_objects([truth[k] for k in used], at_boxes, slots, [rows[k] for k in used], model))
+    if not objects:
+        raise input_error(
+            "no object to evaluate on", got=f"{len(scenes)} scenes",
+            expected=f"a box with a side of {config.least_side} px, {config.least_visibility:.0%} of it seen",
+        )  # fmt: skip
+    categories = model.config.categories
+    records = concatenate(objects)
+    detections = measure_detections(boxes, labels, counts, answers, len(categories), regions=regions)
+    rng = np.random.default_rng(config.seed)
+    estimates = figures(records, detections, len(scenes), model.config.symmetry, rng, config.resamples)
+    return Evaluation(records, detections, estimates, len(scenes), categories)
+
+
+def measure_retrieval(
+    config: EvaluateConfig, model: ObservationModel | Pyramid, views: InstanceViews
+) -> RetrievalRecords:
+    """Render two views of every instance, take the shape latent at the true box, and seek each among the others.
+
+    Raises:
+        InputError: no category has two instances.
+    """
+    instances = views.instances
+    if not instances:
+        raise input_error("instances to find again", got=0, expected="at least two of a category")
+    means, scales = [], []
+    step = max(1, config.batch // 2)
+    for start in tqdm(range(0, len(instances), step), desc="retrieval", unit="batch", disable=None):
+        pairs = [views.pair(*instance) for instance in instances[start : start + step]]
+        flat = [view for pair in pairs for view in pair]
+        answers = model.observe_boxes(
+            [view.image for view in flat], np.array([view.intrinsics for view in flat]), [view.box for view in flat],
+            decode=False, batch=config.batch,
+        )  # fmt: skip
+        means.append(np.array([answer.latent[0] for answer in answers]).reshape(len(pairs), 2, -1))
+        scales.append(np.array([answer.latent_scale[0] for answer in answers]).reshape(len(pairs), 2, -1))
+    category = np.array([views.categories.index(name) for name, _ in instances])
+    return retrieve(np.concatenate(means), np.concatenate(scales), category, model.prior_mean())
+
+
+def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
+    """The content of metrics.json: figures by name, their intervals and counts, tables, and what they came from."""
+    estimates = evaluation.figures
+    found = evaluation.retrieval
+    return {
+        **{name: one.value for name, one in estimates.items()},
+        "intervals": {name: None if one.low is None else [one.low, one.high] for name, one in estimates.items()},
+        "counts": {name: one.count for name, one in estimates.items()},
+        "scenes": evaluation.scenes,
+        "objects": len(evaluation.objects),
+        "by_category": category_table(evaluation.objects, evaluation.detections, evaluation.categories),
+        "by_difficulty": difficulty_table(evaluation.objects),
+        "confusion": confusion(evaluation.objects, len(evaluation.categories)).tolist(),
+        "retrieval": None if found is None else retrieval_table(found, evaluation.categories),
+        "categories": list(evaluation.categories),
+        "configuration": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()},
+        "seeds": {"scenes": config.seed if config.scenes is None else None, "bootstrap": config.seed},
+        "versions": {
+            "nolbo_ppl": __version__, "python": platform.python_version(), "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+    }  # fmt: skip
+
+
+def table(evaluation: Evaluation) -> str:
+    """The figures with their 95 % intervals, and the main ones by category, as text."""
+    lines = [f"{'figure':<32}{'value':>9}   {'95 % interval':<20}{'of':>7}"]
+    for name, one in evaluation.figures.items():
+        interval = "" if one.low is None or one.high is None else f"[{one.low:.3f}, {one.high:.3f}]"
+        lines.append(f"{name:<32}{_number(one.value):>9}   {interval:<20}{one.count:>7}")
+    columns = ("ap50", "category_accuracy", "acc_pi6", "med_err_deg", "voxel_iou", "voxel_iou_gain")
+    lines += ["", f"{'category':<14}{'objects':>8}" + "".join(f"{name:>19}" for name in columns)]
+    for name, row in category_table(evaluation.objects, evaluation.detections, evaluation.categories).items():
+        lines.append(f"{name:<14}{row['objects']:>8}" + "".join(f"{_number(row[column]):>19}" for column in columns))
+    return "\n".join(lines)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def run(config: EvaluateConfig) -> Evaluation:
+    """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`."""
+    loaded = load(config.model)
+    model = Pyramid(loaded, config.sizes) if config.sizes else loaded
+    scenes = open_scenes(config, model.config)
+    evaluation = measure(config, model, scenes)
+    if config.retrieval:
+        views = InstanceViews(open_source(config, model.config), config.gallery, model.config.categories)
+        found = measure_retrieval(config, model, views)
+        rng = np.random.default_rng([config.seed, 1])
+        estimates = {**evaluation.figures, **retrieval_figures(found, rng, config.resamples)}
+        evaluation = replace(evaluation, figures=estimates, retrieval=found)
+    values = metrics(evaluation, config)
+    write_json(config.out / "metrics.json", values)
+    if config.pictures:
+        _draw(evaluation, values, scenes, model, config.out)
+    return evaluation
+
+
+def _draw(
+    evaluation: Evaluation, values: dict[str, Any], scenes: Scenes, model: ObservationModel | Pyramid, out: Path
+) -> None:
+    """Plots, examples, and the page that shows them with every figure."""
+    from nolbo_ppl.viz.detection_plots import write_detections
+    from nolbo_ppl.viz.evaluation_page import write_page
+    from nolbo_ppl.viz.evaluation_plots import write_plots
+    from nolbo_ppl.viz.example_plots import write_examples
+
+    objects, found = evaluation.objects, evaluation.detections
+    pictures = write_plots(objects, found, evaluation.categories, model.config.symmetry, out, evaluation.retrieval)
+    write_examples(objects, scenes, model, out / "examples.png")
+    pictures.append(out / "examples.png")
+    if write_detections(found.all, scenes, model, out / "detections.png") is not None:
+        pictures.append(out / "detections.png")
+    write_page(values, pictures, out / "index.html")
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Command line: parse the options, run, print the figures."""
+    import tyro
+
+    config = tyro.cli(EvaluateConfig, args=args, prog="nolbo evaluate", description=__doc__)
+    sys.stdout.write(table(run(config)) + f"\n\nwritten to {config.out}\n")
+
+
+if __name__ == "__main__":
+    main()

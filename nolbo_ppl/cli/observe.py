@@ -1,0 +1,131 @@
+"""`nolbo observe`: posteriors of the objects in a folder of images, as `observations.jsonl` and pictures."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+from tqdm import tqdm
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
+from nolbo_ppl.io.files import atomic_path, write_jsonl
+from nolbo_ppl.structures.object_posteriors import Observations
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+"""Files of these names are images."""
+
+
+@dataclass(frozen=True)
+class ObserveConfig:
+    """What to observe and where to write."""
+
+    images: Path
+    """Folder of images; a detection's `frame` is the index of its image in sorted order."""
+    out: Path
+    """Folder for observations.jsonl and the pictures."""
+    model: str = "tiny"
+    """Name of weights in the package, or a folder with a model of your own."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
+    threshold: float = 0.3
+    """Least objectness of a detection."""
+    pictures: bool = True
+    """Draw the posterior over each image."""
+    batch: int = 16
+    """Images that go through the network at once."""
+    seed: int = 0
+    """Seed of the samples behind the voxels' mean and variance."""
+    size: int | None = None
+    """Longer side, px, at which the network looks at each image, a multiple of 32; its own by default. Larger for wide
+    images whose objects would else be too small."""
+
+
+@dataclass(frozen=True)
+class ObserveSummary:
+    """What was done."""
+
+    images: int
+    """Images observed."""
+    detections: int
+    """Lines of observations.jsonl."""
+    file: Path
+    """The observations."""
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """Images of a folder in sorted order.
+
+    Raises:
+        InputError: no such folder, or no image in it.
+    """
+    if not folder.is_dir():
+        raise input_error("no such folder of images", file=folder)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    if not paths:
+        raise input_error("a folder without images", expected=f"files named {', '.join(IMAGE_SUFFIXES)}", file=folder)
+    return paths
+
+
+def read_image(path: Path) -> np.ndarray:
+    """An image file as uint8 [height, width, 3]. Raises `InputError` naming the file when it cannot be decoded."""
+    try:
+        with Image.open(path) as opened:
+            return np.asarray(opened.convert("RGB"))
+    except (OSError, UnidentifiedImageError) as error:
+        raise input_error("not a readable picture", got=error, file=path) from None
+
+
+def run(config: ObserveConfig) -> ObserveSummary:
+    """Observe every image of the folder; `observations.jsonl` appears complete or not at all."""
+    paths, model = image_paths(config.images), load(config.model)
+    if config.out.resolve() == config.images.resolve():
+        raise input_error("pictures would be written over the images", got=config.out, do="choose another --out")
+    config.out.mkdir(parents=True, exist_ok=True)
+    rows = list(_rows(config, paths, model))
+    write_jsonl(config.out / "observations.jsonl", rows)
+    return ObserveSummary(len(paths), len(rows), config.out / "observations.jsonl")
+
+
+def _rows(config: ObserveConfig, paths: list[Path], model: ObservationModel) -> Iterator[dict]:
+    bar = tqdm(total=len(paths), desc="observing", unit="image", disable=None)
+    with bar:
+        for first in range(0, len(paths), config.batch):
+            part = paths[first : first + config.batch]
+            images = [read_image(path) for path in part]
+            observed = model.observe(
+                images, config.intrinsics, threshold=config.threshold, size=config.size, batch=config.batch, seed=config.seed
+            )
+            for offset, (path, image, observations) in enumerate(zip(part, images, observed)):
+                yield from observations.rows(first + offset, path.name)
+                if config.pictures:
+                    _draw(config, path, image, observations, model)
+            bar.update(len(part))
+
+
+def _draw(
+    config: ObserveConfig, path: Path, image: np.ndarray, observations: Observations, model: ObservationModel
+) -> None:
+    """The posterior over the image, as `OUT/NAME.png`."""
+    from nolbo_ppl.viz.posterior_plots import draw_observations  # matplotlib is only needed for pictures
+
+    camera = guessed_intrinsics(image) if config.intrinsics is None else np.array(config.intrinsics)
+    with atomic_path(config.out / f"{path.stem}.png") as temporary:
+        draw_observations(image, observations, camera, prior_mean=model.prior_mean(), path=temporary)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Parse the command line and observe."""
+    import tyro
+
+    summary = run(tyro.cli(ObserveConfig, args=args, prog="nolbo observe", description=__doc__))
+    sys.stdout.write(f"{summary.detections} objects in {summary.images} images: {summary.file}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""`nolbo odometry`: images in, a drifting trajectory with covariances out."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from nolbo_ppl._version import __version__
+from nolbo_ppl.data.sequences import FrameSequence, open_frames, read_intrinsics, read_lengths
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.files import atomic_path, write_json
+from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, poses_of_frames, write_trajectory
+from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, path_length
+from nolbo_ppl.odometry import (
+    GroundHeight,
+    KnownLengths,
+    Odometry,
+    OdometryConfig,
+    Scale,
+    StepFlag,
+    estimate_odometry,
+    lengths_of,
+)
+
+
+@dataclass(frozen=True)
+class OdometryArguments:
+    """Simple visual odometry: motion from matched features, its length from elsewhere, a covariance for every step."""
+
+    images: Path
+    """Folder of images (KITTI, TUM RGB-D, any names) or a video."""
+    intrinsics: Path
+    """intrinsics.json, a KITTI calib.txt, or a text file with fx fy cx cy."""
+    out: Path
+    """Folder for odometry.txt, odometry_covariance.npz and odometry.json."""
+    scale: Literal["truth", "ground", "file"] = "ground"
+    """Length of the steps: of the true trajectory, from the ground under the camera, or of a file (a wheel)."""
+    truth: Path | None = None
+    """True trajectory, a row a frame (or TUM rows matched by time): for `--scale truth`, and for errors."""
+    lengths: Path | None = None
+    """Lengths of the steps in metres, one a line, for `--scale file`."""
+    camera_height: float | None = None
+    """Height of the camera over the ground in metres, for `--scale ground`."""
+    camera_pitch: float = 0.0
+    """How far the camera looks down, rad, for `--scale ground`."""
+    first: int = 0
+    """First frame."""
+    count: int | None = None
+    """Number of frames; all when left out."""
+    config: OdometryConfig = field(default_factory=OdometryConfig)
+    """Settings."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some frames of a sequence in a row."""
+
+    frames: FrameSequence
+    first: int
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def frame(self, k: int, /) -> np.ndarray:
+        """Frame k of the part."""
+        return self.frames.frame(self.first + k)
+
+
+def part_of(frames: FrameSequence, first: int, count: int | None) -> Part:
+    """The frames asked for. Raises `InputError` when they are not there."""
+    rest = len(frames) - first
+    if first < 0 or rest < 1 or (count is not None and not 1 <= count <= rest):
+        raise input_error("frames asked for", got=f"{count if count is not None else 'all'} from {first}",
+                          expected=f"frames within 0 to {len(frames) - 1}")
+    return Part(frames, first, rest if count is None else count)
+
+
+def frame_times(part: Part) -> np.ndarray | None:
+    """Times of the frames in s; None unless all are known."""
+    times = part.frames.times
+    return None if times is None else times[part.first : part.first + len(part)]
+
+
+def true_poses(path: Path, part: Part) -> np.ndarray:
+    """True poses of the frames.
+
+    Raises:
+        InputError: rows that match the sequence neither in number nor by time.
+    """
+    rows = slice(part.first, part.first + len(part))
+    return poses_of_frames(path, len(part.frames), part.frames.times, rows)
+
+
+def known_lengths(path: Path, part: Part) -> np.ndarray:
+    """Lengths of the part's steps from a file of all steps, or of the part's alone. Raises `InputError` otherwise."""
+    lengths = read_lengths(path)
+    if len(lengths) == len(part) - 1:
+        return lengths
+    if len(lengths) == len(part.frames) - 1:
+        return lengths[part.first : part.first + len(part) - 1]
+    raise input_error("lengths do not match the frames", got=f"{len(lengths)} lengths",
+                      expected=f"{len(part.frames) - 1}, one fewer than frames", file=path)
+
+
+def scale_of(arguments: OdometryArguments, part: Part, truth: np.ndarray | None) -> Scale:
+    """Where lengths come from. Raises `InputError` when the option that gives them is missing."""
+    if arguments.scale == "truth":
+        if truth is None:
+            raise input_error("--scale truth without a trajectory", do="give --truth FILE")
+        return KnownLengths(lengths_of(truth))
+    if arguments.scale == "file":
+        if arguments.lengths is None:
+            raise input_error("--scale file without lengths", do="give --lengths FILE, one length a line")
+        return KnownLengths(known_lengths(arguments.lengths, part))
+    if arguments.camera_height is None:
+        raise input_error("--scale ground without the height of the camera", do="give --camera-height METRES")
+    return GroundHeight(arguments.camera_height, arguments.camera_pitch)
+
+
+def summary(odometry: Odometry, truth: np.ndarray | None, seconds: float) -> dict[str, Any]:
+    """Figures of a run: counts, speed, and errors where the truth is known."""
+    names = {flag.name: int(np.sum((odometry.flags & flag) > 0)) for flag in StepFlag if flag}
+    figures: dict[str, Any] = {
+        "frames": len(odometry), "path_length": path_length(odometry.T_world_camera),
+        "median_inliers": float(np.median(odometry.inliers)) if len(odometry) > 1 else 0.0,
+        "flags": names, "seconds": round(seconds, 3), "frames_per_second": round(len(odometry) / max(seconds, 1e-9), 2),
+    }
+    if truth is not None and len(odometry) > 1:
+        error = absolute_trajectory_error(odometry.T_world_camera, truth, "se3").rmse
+        way = path_length(truth)
+        figures |= {"true_path_length": way, "ate": error, "ate_percent": 100.0 * error / way if way > 0 else None}
+    return figures
+
+
+def write_odometry(out: Path, odometry: Odometry, times: np.ndarray | None, report: dict[str, Any]) -> None:
+    """Write odometry.txt (KITTI rows), odometry_covariance.npz, times.txt where known, and odometry.json, each atomically."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_trajectory(out / "odometry.txt", Trajectory(odometry.T_world_camera))
+    with atomic_path(out / COVARIANCE) as temporary:
+        np.savez(temporary, covariance=odometry.covariance, matches=odometry.matches, inliers=odometry.inliers,
+                 flags=odometry.flags)
+    if times is not None:
+        with atomic_path(out / "times.txt") as temporary:
+            temporary.write_text("".join(f"{stamp!r}\n" for stamp in times.tolist()), encoding="utf-8")
+    write_json(out / "odometry.json", report)
+
+
+def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
+    """Read, estimate, write; returns the odometry and the report.
+
+    Raises:
+        InputError: unusable input; nothing half-written is left.
+    """
+    part = part_of(open_frames(arguments.images), arguments.first, arguments.count)
+    intrinsics = read_intrinsics(arguments.intrinsics, part.frames.size)
+    truth = None if arguments.truth is None else true_poses(arguments.truth, part)
+    scale = scale_of(arguments, part, truth)
+    begin = time.perf_counter()
+    odometry = estimate_odometry(part, intrinsics, scale, arguments.config, progress=True)
+    figures = summary(odometry, truth, time.perf_counter() - begin)
+    options = {name: str(value) if isinstance(value, Path) else value
+               for name, value in asdict(arguments).items() if name != "config"}
+    report = {"version": __version__, "options": options, "config": asdict(arguments.config), **figures}
+    write_odometry(arguments.out, odometry, frame_times(part), report)
+    return odometry, report
+
+
+def describe(report: dict[str, Any]) -> str:
+    """A few lines for the terminal."""
+    flags = {name: count for name, count in report["flags"].items() if count}
+    lines = [f"{report['frames']} frames, {report['path_length']:.1f} m, {report['frames_per_second']:.1f} frames/s, "
+             f"{report['median_inliers']:.0f} inliers"]
+    if flags:
+        lines.append("guessed steps: " + json.dumps(flags))
+    if "ate" in report:
+        percent = "" if report["ate_percent"] is None else f" ({report['ate_percent']:.2f} % of the way)"
+        lines.append(f"ATE {report['ate']:.3f} m{percent}")
+    return "\n".join(lines)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Command line of `nolbo odometry`."""
+    import sys
+
+    import tyro
+
+    arguments = tyro.cli(OdometryArguments, prog="nolbo odometry", args=args)
+    _, report = run(arguments)
+    sys.stdout.write(describe(report) + f"\nwritten to {arguments.out}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""`nolbo train`: stochastic variational inference in stages, from shapes to single objects to scenes.
+
+Stages (NOLBO, training details; docs/training.md): the shape autoencoder (decoder, prior networks, 3D encoder); the
+guide on images of one object; the guide on scenes, decoder and prior frozen. Every batch is a function of the seed and
+the step, checkpoints hold all that a step changes, and a killed run goes on exactly where its last checkpoint stands.
+Started by `torchrun`, several processes or machines share each batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+
+from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
+from nolbo_ppl.training.trainer import TrainSummary as TrainSummary
+from nolbo_ppl.training.trainer import run as run
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Parse the command line and train."""
+    import tyro
+
+    summary = run(tyro.cli(TrainConfig, args=args, prog="nolbo train", description=__doc__))
+    sys.stdout.write(json.dumps(dataclasses.asdict(summary), indent=2, default=str) + "\n")
+
+
+if __name__ == "__main__":
+    main()

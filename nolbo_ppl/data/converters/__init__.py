@@ -1,0 +1,14 @@
+"""Public data sets turned into odometry, truth and observations in the formats of `nolbo slam`, or into scenes."""
+
+from __future__ import annotations
+
+from nolbo_ppl.data.converters.converted import Converted, write_converted
+from nolbo_ppl.data.converters.kitti_object import convert_kitti_object
+from nolbo_ppl.data.converters.kitti_poles import convert_kitti_poles
+from nolbo_ppl.data.converters.kitti_tracking import convert_kitti_tracking
+from nolbo_ppl.data.converters.ycbv_slam import convert_ycbv_slam
+
+__all__ = [
+    "Converted", "convert_kitti_object", "convert_kitti_poles", "convert_kitti_tracking", "convert_ycbv_slam",
+    "write_converted",
+]  # fmt: skip

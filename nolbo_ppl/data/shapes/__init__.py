@@ -1,8 +1,0 @@
-"""Parametric shapes of the twelve categories: continuous families of instances made of analytic primitives."""
-
-from __future__ import annotations
-
-from nolbo_ppl.data.shapes.families import make_shape, shape_from_seed
-from nolbo_ppl.data.shapes.shape import MATERIAL_ROLES, AnalyticSolid, Shape, Solid
-
-__all__ = ["MATERIAL_ROLES", "AnalyticSolid", "Shape", "Solid", "make_shape", "shape_from_seed"]

@@ -1,0 +1,187 @@
+"""What is true in a drive: objects, their shapes, and which of them a frame shows; and whose a detection is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.boxes import pairwise_iou
+from nolbo_ppl.metrics.detection import match_image
+
+if TYPE_CHECKING:
+    from nolbo_ppl.synthetic.worlds import DriveFrame
+
+LEAST_SIDE = 12.0
+"""Objects whose box is smaller than this, px, need not be found."""
+LEAST_VISIBILITY = 0.5
+"""Objects of which less is seen need not be found."""
+IOU = 0.5
+"""Overlap of a detection with the object it is of."""
+
+
+@dataclass(frozen=True)
+class TrueFrame:
+    """Objects seen in one frame."""
+
+    object: Int[np.ndarray, " m"]
+    """Number of each in the drive."""
+    box: Float[np.ndarray, "m 4"]
+    """[x0, y0, x1, y1], px."""
+    position: Float[np.ndarray, "m 3"]
+    """Box centre in the camera frame, m."""
+    R_camera_object: Float[np.ndarray, "m 3 3"]
+    """Egocentric rotation."""
+    visibility: Float[np.ndarray, " m"]
+    """Visible share."""
+
+    @property
+    def counts(self) -> Bool[np.ndarray, " m"]:
+        """Objects that are to be found: large enough, and seen well enough."""
+        side = np.max(self.box[:, 2:] - self.box[:, :2], axis=1, initial=0.0)
+        return (side >= LEAST_SIDE) & (self.visibility >= LEAST_VISIBILITY)
+
+
+@dataclass(frozen=True)
+class DriveTruth:
+    """True objects of a drive."""
+
+    names: tuple[str, ...]
+    """`id` of each object."""
+    category: tuple[str, ...]
+    """Its category."""
+    instance: tuple[str, ...]
+    """Its shape's name."""
+    T_world_object: Float[np.ndarray, "m 4 4"]
+    """Its pose, at the start where it moves."""
+    diagonal: Float[np.ndarray, " m"]
+    """Its box diagonal, m."""
+    symmetry: Int[np.ndarray, " m"]
+    """1 none, n n-fold, 0 free about the vertical axis."""
+    moving: Bool[np.ndarray, " m"]
+    """Whether it moves."""
+    packed: Mapping[str, UInt8[np.ndarray, " bytes"]]
+    """Packed 32^3 grid by instance."""
+    frames: tuple[TrueFrame, ...]
+    """What each keyframe shows."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def _frame(seen: DriveFrame, number: Mapping[str, int], file: Path) -> TrueFrame:
+    n = len(seen.ids)
+    if any(one.position is None or one.R_camera_object is None for one in seen.objects):
+        raise input_error("an object without position or rotation", got=seen.image.name, expected="both", file=file)
+    return TrueFrame(
+        object=np.array([number[name] for name in seen.ids], dtype=np.int64),
+        box=np.array([one.box for one in seen.objects], dtype=np.float64).reshape(n, 4),
+        position=np.array([one.position for one in seen.objects], dtype=np.float64).reshape(n, 3),
+        R_camera_object=np.array([one.R_camera_object for one in seen.objects], dtype=np.float64).reshape(n, 3, 3),
+        visibility=np.array([one.visibility for one in seen.objects], dtype=np.float64),
+    )
+
+
+def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
+    """True objects of a drive folder, frame by frame for the given images.
+
+    Args:
+        folder: the drive (`nolbo drive`).
+        images: names of the keyframes' images; the last part of a path decides.
+
+    Raises:
+        InputError: a file is missing or malformed, or an image is not one of the drive's.
+    """
+    from nolbo_ppl.synthetic.worlds import read_drive  # delayed: it brings the renderer
+
+    drive = read_drive(folder)
+    things = drive.objects
+    number = {thing.id: i for i, thing in enumerate(things)}
+    by_image = {seen.image.name: seen for seen in drive.frames}
+    missing = [image for image in images if Path(image).name not in by_image]
+    if missing:
+        raise input_error("not an image of the drive", got=missing[0], expected=f"one of {len(drive)} images", file=folder)
+    packed = drive.voxels()
+    without = sorted({thing.instance for thing in things} - set(packed))
+    if without:
+        raise input_error("a true shape is missing", got=without[0], expected="a grid for every instance", file=folder)
+    return DriveTruth(
+        names=tuple(thing.id for thing in things),
+        category=tuple(thing.category for thing in things),
+        instance=tuple(thing.instance for thing in things),
+        T_world_object=np.array([thing.T_world_object for thing in things]).reshape(-1, 4, 4),
+        diagonal=np.array([thing.diagonal for thing in things], dtype=np.float64),
+        symmetry=np.array([thing.symmetry for thing in things], dtype=np.int64),
+        moving=np.array([thing.moving for thing in things], dtype=bool),
+        packed=packed,
+        frames=tuple(_frame(by_image[Path(image).name], number, folder) for image in images),
+    )
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Whose each detection is."""
+
+    object: Int[np.ndarray, " k"]
+    """Number of the true object, -1 for none."""
+    row: Int[np.ndarray, " k"]
+    """Its row in the truth of the frame, -1 for none."""
+    counted: Bool[np.ndarray, " k"]
+    """Matched to an object that was to be found."""
+    found: int
+    """Objects (of all frames) that were to be found and were."""
+    wanted: int
+    """Objects (of all frames) that were to be found."""
+
+    @property
+    def precision(self) -> float:
+        """Share of the detections that are of an object; those of hardly seen ones are left out."""
+        judged = self.counted | (self.object < 0)
+        return float(self.counted.sum() / judged.sum()) if judged.any() else float("nan")
+
+    @property
+    def recall(self) -> float:
+        """Share of the objects to be found that were."""
+        return self.found / self.wanted if self.wanted else float("nan")
+
+
+def object_shown(
+    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], truth: DriveTruth, least_overlap: float
+) -> Int[np.ndarray, " k"]:
+    """Number of the object each detection overlaps most, -1 where none reaches `least_overlap` (IoU).
+
+    Unlike `match_detections`, two detections may be of one object: whose a detection is does not depend on the others.
+    """
+    shown = np.full(len(frame), -1)
+    for t, seen in enumerate(truth.frames):
+        rows = np.flatnonzero(frame == t)
+        if len(rows) and len(seen.object):
+            overlap = pairwise_iou(torch.from_numpy(box[rows]), torch.from_numpy(seen.box)).numpy()
+            best = overlap.argmax(1)
+            shown[rows] = np.where(overlap.max(1) >= least_overlap, seen.object[best], -1)
+    return shown
+
+
+def match_detections(
+    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], objectness: Float[np.ndarray, " k"], truth: DriveTruth,
+    iou_threshold: float = IOU,
+) -> Matched:
+    """Match detections with the objects of their frames, greedily by objectness, at most one an object (as COCO does)."""
+    object_of, row_of = np.full(len(frame), -1), np.full(len(frame), -1)
+    counted = np.zeros(len(frame), dtype=bool)
+    found = wanted = 0
+    for t, seen in enumerate(truth.frames):
+        rows, counts = np.flatnonzero(frame == t), seen.counts
+        matched = match_image(box[rows], objectness[rows], seen.box, ~counts, iou_threshold)
+        hit = matched >= 0
+        object_of[rows[hit]], row_of[rows[hit]] = seen.object[matched[hit]], matched[hit]
+        counted[rows[hit]] = counts[matched[hit]]
+        found += int(counts[matched[hit]].sum())
+        wanted += int(counts.sum())
+    return Matched(object_of, row_of, counted, found, wanted)

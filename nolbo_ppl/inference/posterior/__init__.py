@@ -1,0 +1,1 @@
+"""Queries on the amortised posterior: images in, posteriors of objects out."""

@@ -1,0 +1,237 @@
+"""Queries on the amortised posterior (NOLBO, appendix III): load a model, show it images, get distributions back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.boxes import box_iou, suppress
+from nolbo_ppl.inference.posterior.decode import Regions, assemble
+from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer, decode_latents, extents, sampled_shapes
+from nolbo_ppl.inference.posterior.preprocess import Image as Image
+from nolbo_ppl.inference.posterior.preprocess import Prepared, prepare_all, same_shape
+from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guessed_intrinsics
+from nolbo_ppl.models.guide import Encoding
+from nolbo_ppl.models.head import RegionParameters
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.posterior_calibration import Calibration
+from nolbo_ppl.models.scene_batch import cell_of, decode_box
+from nolbo_ppl.structures.object_posteriors import Observations
+
+CANDIDATE = 0.02
+"""Regions of at least this objectness count towards the object they describe."""
+
+Found: TypeAlias = tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, "n 4"] | None]
+"""Regions of a batch to answer for: image, number, log odds, and boxes to look at where they are given, px."""
+
+
+class ObservationModel:
+    """A trained observation model, ready for images of any size.
+
+    Args:
+        model: the networks; put into evaluation mode.
+        calibration: factors on the guide's posterior.
+    """
+
+    def __init__(self, model: Nolbo, calibration: Calibration | None = None) -> None:
+        self.model = model.eval().requires_grad_(False)
+        self.calibration = calibration or Calibration()
+        self.config = model.config
+        self._prior_mean = model.story.prior.label_mean().detach()
+
+    def prior_mean(self) -> Float[np.ndarray, "labels d"]:
+        """mu_psi(l) of every category."""
+        return self._prior_mean.numpy()
+
+    @torch.inference_mode()
+    def decode(self, latent: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n v v v"]:
+        """Occupancy probability of each voxel of the canonical grid, for given shape latents."""
+        z = torch.as_tensor(np.asarray(latent), dtype=self._prior_mean.dtype)
+        if z.dim() != 2 or z.shape[1] != self.config.latent_dim:
+            raise input_error("shape latents", got=tuple(z.shape), expected=f"(n, {self.config.latent_dim})")
+        if len(z) == 0:
+            return np.zeros((0,) + (self.config.voxel_size,) * 3, dtype=np.float32)
+        return decode_latents(self.model.story.decoder, z)
+
+    @torch.inference_mode()
+    def shape_posterior(
+        self, packed: UInt8[np.ndarray, "n bytes"]
+    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+        """Mean and scale of q(z | true shape) of packed voxel grids: the shape autoencoder's posterior."""
+        loc, scale = self.model.shape_guide.posterior(torch.as_tensor(packed))
+        return loc.numpy(), scale.numpy()
+
+    def observe(
+        self,
+        images: Image | Sequence[Image],
+        intrinsics: Any = None,
+        *,
+        threshold: float = 0.3,
+        iou_threshold: float = 0.45,
+        size: int | None = None,
+        decode: bool = True,
+        samples: int = 8,
+        seed: int = 0,
+        batch: int = 16,
+    ) -> Any:
+        """Posterior of every object of an image, or of each image of a sequence.
+
+        Args:
+            images: one image or a sequence of images, of any sizes; they are scaled to the network's own.
+            intrinsics: [fx, fy, cx, cy] in px of the given image, one for all or one an image. Without them the camera
+                is taken to see 60 degrees across, and positions are as good as that guess.
+            threshold: least objectness of a detection.
+            iou_threshold: overlap above which the less certain of two regions is taken to describe the same object. Only
+                one region is responsible for an object, so that the probabilities of all that describe it add up.
+            size: longer side, px, that images are scaled to, a multiple of 32; the network's own by default. It is fully
+                convolutional: a larger side suits wide images with objects that would else be too small.
+            decode: decode shapes (voxels, sizes, meshes); without it sizes are the category's mean proportions.
+            samples: samples of the shape latent behind the voxel mean and variance.
+            seed: seed of those samples.
+            batch: images that go through the network at once.
+
+        Returns:
+            `Observations`, or a list of them for a sequence.
+
+        Raises:
+            InputError: an image or its intrinsics cannot be used.
+        """
+        single = (isinstance(images, np.ndarray) and images.ndim == 3) or (isinstance(images, Tensor) and images.dim() == 3)
+        sequence: list[Any] = [images] if single else list(images)  # type: ignore[list-item]
+        prepared = self._prepare_all(sequence, intrinsics, size)
+        if not 0 < threshold < 1:
+            raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
+
+        def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
+            return *self._detections(encoding, logit, threshold, iou_threshold), None
+
+        results = self._observe(prepared, detect, decode, samples, seed, batch)
+        return results[0] if single else results
+
+    def observe_boxes(
+        self,
+        images: Sequence[Image],
+        intrinsics: Any,
+        boxes: Sequence[Float[np.ndarray, "n 4"]],
+        *,
+        size: int | None = None,
+        decode: bool = True,
+        samples: int = 8,
+        seed: int = 0,
+        batch: int = 16,
+    ) -> list[Observations]:
+        """Posterior of the region responsible for each given box (px of the given image), in the order of the boxes.
+
+        The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation). The
+        guide takes its second look at the given box.
+        """
+        if len(boxes) != len(images):
+            raise input_error("boxes", got=f"{len(boxes)} lists", expected=f"one list for each of {len(images)} images")
+        prepared = self._prepare_all(images, intrinsics, size)
+
+        def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
+            scaled = [np.asarray(boxes[i], dtype=np.float64).reshape(-1, 4) * np.tile(prepared[i].scale, 2) for i in group]
+            row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
+            box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
+            region = self._responsible(encoding, row, box)
+            return row, region, logit[row, region], box
+
+        return self._observe(prepared, responsible, decode, samples, seed, batch)
+
+    @torch.inference_mode()
+    def encode(self, image: UInt8[Tensor, "b 3 h w"]) -> Encoding:
+        """The network's forward pass over a batch of prepared images."""
+        return self.model.guide.encode(image)
+
+    @torch.inference_mode()
+    def _observe(
+        self,
+        prepared: list[Prepared],
+        find: Callable[[Encoding, Tensor, list[int]], Found],
+        decode: bool,
+        samples: int,
+        seed: int,
+        batch: int,
+    ) -> list[Observations]:
+        """Run batches of images of one shape; `find` gives what to answer for."""
+
+        def shapes(q: RegionParameters, diagonal: Tensor) -> ShapeAnswer:
+            metres = diagonal.numpy()
+            if not decode:
+                return ShapeAnswer(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
+            story, side = self.model.story, self.config.voxel_size
+            return sampled_shapes(story.decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
+
+        results: dict[int, Observations] = {}
+        for group in same_shape(prepared, batch):
+            encoding = self.encode(torch.stack([prepared[i].image for i in group]))
+            logit = self.calibration.objectness(encoding.objectness_logit)
+            row, region, odds, look_at = find(encoding, logit, group)
+            camera = torch.stack([prepared[i].camera for i in group])[row]
+            scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
+            regions = Regions(self._parameters(encoding, row, region, look_at), region, encoding.columns, odds, camera, scale)
+            answer = assemble(regions, self.config, self.model.story.prior, self._prior_mean, shapes)
+            ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
+            for k, i in enumerate(group):
+                results[i] = answer[slice(ends[k], ends[k + 1])]
+        return [results[i] for i in range(len(prepared))]
+
+    def _prepare_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[Prepared]:
+        return prepare_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
+
+    def _parameters(
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
+    ) -> RegionParameters:
+        q = self.model.guide.parameters_at(encoding, row, region, box=box)
+        return self.calibration.apply(q.at_mode(self._prior_mean))
+
+    def _boxes(
+        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]
+    ) -> Float[Tensor, "n 4"]:
+        """Boxes of regions, px of the scaled image; no second look is needed for them."""
+        q = self.model.guide.parameters_at(encoding, row, region, look=False)
+        return decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
+
+    def _detections(
+        self, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float
+    ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"]]:
+        """Row, region and log odds of the objects above the threshold, best first in a row.
+
+        Regions whose boxes overlap describe one object, for which exactly one of them is responsible: the probability
+        that it is there is the sum of theirs. The most probable region answers for it.
+        """
+        least = min(threshold, CANDIDATE)
+        row, region = (logit > math.log(least / (1 - least))).nonzero(as_tuple=True)
+        if len(region) == 0:
+            return row, region, logit.new_empty(0)
+        box = self._boxes(encoding, row, region)
+        kept, stands_for = suppress(box, logit[row, region], iou_threshold, group=row)
+        probability = torch.zeros(len(row), dtype=torch.float64)
+        probability.index_add_(0, stands_for, torch.sigmoid(logit[row, region].double()))
+        probability = probability.clamp(max=1 - 1e-6)
+        kept = kept[probability[kept] > threshold]
+        kept = kept[torch.argsort(probability[kept], descending=True, stable=True)]
+        kept = kept[torch.argsort(row[kept], stable=True)]
+        return row[kept], region[kept], torch.logit(probability[kept])
+
+    def _responsible(
+        self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
+    ) -> Int[Tensor, " n"]:
+        p, columns = self.config.predictors, encoding.columns
+        cell = cell_of(box, encoding.rows, columns, self.config.stride)
+        region = (cell[:, None] * p + torch.arange(p)).flatten()
+        own = self._boxes(encoding, row.repeat_interleave(p), region).unflatten(0, (-1, p))
+        return cell * p + box_iou(own, box[:, None]).argmax(-1)
+
+    @cached_property
+    def _category_extents(self) -> Float[np.ndarray, "labels 3"]:
+        """Extents, in diagonals, of each category's mean shape."""
+        return extents(self.decode(self.prior_mean()))

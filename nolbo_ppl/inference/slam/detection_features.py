@@ -1,0 +1,130 @@
+"""What an object looks like, as evidence: latents and categories against the population they are drawn from.
+
+A match of latents is worth only as much as it is rare: its likelihood is divided by the density of the population,
+which is estimated from the objects themselves. Twenty identical cars then give no evidence at all, and no match is ever
+worth more than the log of the number of objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
+from nolbo_ppl.io.observations import ObservationTable
+
+LARGE_VARIANCE = 1e12
+"""Variance that stands for a missing latent: it carries no weight."""
+
+
+@dataclass(frozen=True)
+class FeaturePrior:
+    """Population of latents and categories, in its simplest form (one Gaussian, one histogram)."""
+
+    mean: Float[np.ndarray, " d"]
+    """Mean latent."""
+    variance: Float[np.ndarray, " d"]
+    """Its variance over all detections."""
+    categories: tuple[str, ...]
+    """Category names in use."""
+    log_frequency: Float[np.ndarray, " c"]
+    """Log share of each category."""
+    category_error: float
+    """Probability that a category is wrong."""
+
+    def category_log_ratio(self, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """`log p(b | a, same object) - log p(b)`; 0 where either is missing (-1)."""
+        if not self.categories:
+            return np.zeros(len(a))
+        frequency = np.exp(self.log_frequency)[np.maximum(b, 0)]
+        error = 2 * self.category_error  # either of the two may be wrong
+        ratio = np.where(a == b, np.log((1 - error) / frequency + error), np.log(error))
+        return np.where((a < 0) | (b < 0), 0.0, ratio)
+
+    def pair_log_ratio(
+        self, latent_a: np.ndarray, variance_a: np.ndarray, category_a: np.ndarray, latent_b: np.ndarray,
+        variance_b: np.ndarray, category_b: np.ndarray,
+    ) -> Float[np.ndarray, " p"]:
+        """Log ratio of a's features given b to those of any object, nats.
+
+        With latents at hand an equal category adds nothing (it is read off the same latent), a different one counts.
+        """
+        category = self.category_log_ratio(category_b, category_a)
+        if not latent_a.shape[1]:
+            return category
+        known = (variance_a[:, 0] < LARGE_VARIANCE) & (variance_b[:, 0] < LARGE_VARIANCE)
+        latent = latent_log_density(latent_a, latent_b, variance_a + variance_b) - latent_log_density(
+            latent_a, self.mean, variance_a + self.variance)
+        return np.where(known, latent + np.minimum(category, 0.0), category)
+
+
+def latent_log_density(x: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> Float[np.ndarray, " ..."]:
+    """Log density of a diagonal Gaussian, summed over the last axis."""
+    return -0.5 * np.sum((x - mean) ** 2 / variance + np.log(2 * np.pi * variance), axis=-1)
+
+
+def fit_prior(table: ObservationTable, config: SlamConfig) -> FeaturePrior:
+    """Moments of all latents and shares of all categories."""
+    known = table.has_latent
+    d = table.latent_dim
+    mean = table.latent[known].mean(axis=0) if known.any() else np.zeros(d)
+    variance = table.latent[known].var(axis=0) + 1e-12 if known.any() else np.ones(d)
+    named = [c for c in table.category if c is not None]
+    categories, counts = np.unique(named, return_counts=True) if named else (np.zeros(0, str), np.zeros(0))
+    shares = (counts + 1.0) / (counts.sum() + len(counts)) if len(counts) else counts
+    return FeaturePrior(mean, variance, tuple(str(c) for c in categories), np.log(shares), config.category_error)
+
+
+def category_index(table: ObservationTable, prior: FeaturePrior) -> Int[np.ndarray, " n"]:
+    """Index of each detection's category, -1 where it has none or one the prior does not know."""
+    lookup = {name: i for i, name in enumerate(prior.categories)}
+    return np.array([lookup.get(c, -1) if c is not None else -1 for c in table.category], dtype=np.int64).reshape(
+        len(table)
+    )
+
+
+def detection_features(
+    table: ObservationTable, noise: NoiseModel, prior: FeaturePrior
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
+    """Latent, its variance (very large where missing) and category index of every detection."""
+    known = table.has_latent[:, None]
+    latent = np.where(known, np.nan_to_num(table.latent), prior.mean)
+    variance = np.where(known, np.nan_to_num(noise.latent_scale) ** 2, LARGE_VARIANCE)
+    return latent, variance, category_index(table, prior)
+
+
+def fuse_latent(
+    mean_a: np.ndarray, variance_a: np.ndarray, mean_b: np.ndarray, variance_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Precision-weighted mean of two latents and its variance."""
+    variance = 1.0 / (1.0 / variance_a + 1.0 / variance_b)
+    return variance * (mean_a / variance_a + mean_b / variance_b), variance
+
+
+def correlated_variance(
+    variance: Float[np.ndarray, "g d"], count: Float[np.ndarray, " g"], correlation: float
+) -> Float[np.ndarray, "g d"]:
+    """Variance of a mean of n parts with correlation r: `(1 + r (n - 1))` times that of independent parts (docs/slam.md, the
+    latent update); missing ones stay."""
+    factor = 1.0 + correlation * np.maximum(count - 1.0, 0.0)
+    return np.where(variance < LARGE_VARIANCE, variance * factor[:, None], variance)
+
+
+def weighted_latents(
+    latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"], groups: int,
+) -> tuple[Float[np.ndarray, "g d"], Float[np.ndarray, "g d"]]:
+    """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu, corrected:
+    positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get LARGE_VARIANCE.
+    """
+    d = latent.shape[1]
+    precision, total = np.zeros((groups, d)), np.zeros((groups, d))
+    rows = (group >= 0) & (variance < LARGE_VARIANCE).all(axis=1) if d else np.zeros(len(group), bool)
+    w = weight[rows, None] / variance[rows]
+    np.add.at(precision, group[rows], w)
+    np.add.at(total, group[rows], w * latent[rows])
+    known = precision > 1.0 / LARGE_VARIANCE
+    mean = np.where(known, total / np.where(known, precision, 1.0), 0.0)
+    return mean, np.where(known, 1.0 / np.where(known, precision, 1.0), LARGE_VARIANCE)

@@ -1,0 +1,1 @@
+"""Object SLAM keyframe by keyframe."""

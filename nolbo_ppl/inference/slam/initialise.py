@@ -1,0 +1,189 @@
+"""`init`: scales, tracklets, and the graph of odometry and tracklets solved for the first time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.geometry.pose import inverse, make_pose, transform
+from nolbo_ppl.inference.slam.detection_features import (
+    FeaturePrior,
+    correlated_variance,
+    detection_features,
+    fit_prior,
+    weighted_latents,
+)
+from nolbo_ppl.inference.slam.gaussian import log_normal
+from nolbo_ppl.inference.slam.graph import (
+    Estimate,
+    Linearisation,
+    Links,
+    add_landmark_priors,
+    add_links,
+    add_observation_factors,
+    linearise,
+    odometry_factors,
+    optimise,
+    resolve_observations,
+)
+from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
+from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
+from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, stated_scales
+from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
+from nolbo_ppl.inference.slam.orientation import mixture_log_density, observed_modes, resolved_symmetry
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.slam_state import SlamState
+from nolbo_ppl.inference.slam.tracking import Tracklets, build_tracklets
+
+RETRACK = 2.5
+"""Growth of an odometry scale beyond which objects are tracked anew."""
+
+
+def first_estimate(
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"],
+    landmarks: int,
+) -> Estimate:
+    """Landmarks at the weighted mean of their detections in the odometry frame, oriented as most of them agree."""
+    table = problem.observations
+    frame = table.frame[rows]
+    world = transform(problem.odometry[frame], table.position[rows])
+    w = 1.0 / np.maximum(np.trace(noise.position_covariance[rows], axis1=1, axis2=2), 1e-12)
+    total = np.bincount(landmark, weights=w, minlength=landmarks)
+    mean = np.stack([np.bincount(landmark, weights=w * world[:, i], minlength=landmarks) for i in range(3)], axis=1)
+    T = make_pose(np.tile(np.eye(3), (landmarks, 1, 1)), mean / np.maximum(total, 1e-300)[:, None])
+    symmetry = resolved_symmetry(table, config)[rows]
+    oriented = np.flatnonzero(table.has_rotation[rows])
+    modes = observed_modes(table, np.maximum(noise.rotation_scale, 0.05), rows[oriented])
+    modes = modes.turned(problem.odometry[frame[oriented], :3, :3])
+    order = np.argsort(landmark[oriented], kind="stable")
+    groups, starts = np.unique(landmark[oriented][order], return_index=True)
+    for j, members in zip(groups, np.split(order, starts[1:])):
+        # The mode most detections agree with: a mean would fall between flips.
+        members = members[np.linspace(0, len(members) - 1, min(len(members), 12)).astype(int)]
+        candidates = modes.R[members][np.isfinite(modes.log_weight[members])]
+        a, b = np.repeat(np.arange(len(candidates)), len(members)), np.tile(members, len(candidates))
+        value = mixture_log_density(candidates[a], modes.select(b), symmetry[oriented[b]], config)
+        T[j, :3, :3] = candidates[np.argmax(value.reshape(len(candidates), -1).sum(axis=1))]
+    return Estimate(problem.odometry.copy(), T)
+
+
+def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
+    """Odometry, weighted observations and weak priors; the M-step adds its links."""
+    factors = resolve_observations(state.problem, state.noise, state.config, state.estimate, state.rows, state.landmark,
+                                   state.weight)
+    graph = odometry_factors(state.problem, state.noise)
+    add_observation_factors(graph, factors)
+    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
+    return graph
+
+
+def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
+    """Probability of each detection in the graph being its object rather than background, given the estimate.
+
+    Odds are objectness times the density of the position about the prediction, against the clutter density. This is how
+    gross errors leave the graph: by evidence, with weights frozen through the next M-step.
+    """
+    table, rows = state.problem.observations, state.rows
+    frame = table.frame[rows]
+    predicted = transform(
+        inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
+    )
+    error = predicted - table.position[rows]
+    S = state.noise.position_covariance[rows]
+    objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
+    log_object = np.log(objectness) + log_normal(error, S)
+    log_background = np.log1p(-objectness) + np.log(state.noise.clutter_rate)
+    return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
+
+
+def tracklet_features(
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior, rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"], landmarks: int,
+) -> TrackletFeatures:
+    """Latent posterior, category, symmetry and life span of each landmark from its detections."""
+    table = problem.observations
+    latent, variance, category = detection_features(table, noise, prior)
+    mean, spread = weighted_latents(latent[rows], variance[rows], landmark, weight, landmarks)
+    views = np.bincount(landmark, weights=weight * table.has_latent[rows], minlength=landmarks)
+    spread = correlated_variance(spread, views, config.latent_correlation or 0.0)
+    votes = np.zeros((landmarks, len(prior.categories) + 1))
+    named = category[rows] >= 0
+    np.add.at(votes, (landmark[named], category[rows][named]), weight[named])
+    best = np.where(votes.sum(axis=1) > 0, np.argmax(votes, axis=1), -1)
+    symmetry = np.ones(landmarks, dtype=np.int64)
+    symmetry[landmark] = resolved_symmetry(table, config)[rows]
+    oriented = np.zeros(landmarks, dtype=bool)
+    oriented[landmark[table.has_rotation[rows]]] = True
+    first, last = np.full(landmarks, len(problem)), np.full(landmarks, -1)
+    np.minimum.at(first, landmark, table.frame[rows])
+    np.maximum.at(last, landmark, table.frame[rows])
+    return TrackletFeatures(mean, spread, log_population(mean, spread), best, symmetry, oriented, first, last)
+
+
+def linearise_state(state: SlamState) -> Linearisation:
+    """Linearise the graph with its links at the estimate, each link by its robust weight there."""
+
+
+    graph = base_graph(state)
+    add_links(graph, state.links, state.config.robust_width)
+    return linearise(graph, state.estimate)
+
+
+def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
+    """Scales, tracklets, and the graph of odometry and tracklets solved once; no loop is closed yet.
+
+    Raises:
+        InputError: the problem is malformed (see `SlamProblem`).
+        GraphError: GTSAM could not solve the graph.
+    """
+    noise = estimate_noise(problem, config)
+    prior = fit_prior(problem.observations, config)
+    tracklets = build_tracklets(problem, noise, config, prior)
+    state = init_from_tracklets(problem, config, noise, prior, tracklets)
+    if all(stated_scales(problem, config)) or not len(tracklets):
+        return state
+    # Tracks were broken where the default scales were much too small: track once more with the better ones.
+    growth = (
+        np.median(state.noise.rotation_step / noise.rotation_step),
+        np.median(state.noise.translation_step / noise.translation_step),
+    )
+    if max(growth) < RETRACK:
+        return state
+    noise = replace(noise, rotation_step=state.noise.rotation_step, translation_step=state.noise.translation_step)
+    return init_from_tracklets(problem, config, noise, prior, build_tracklets(problem, noise, config, prior))
+
+
+def init_from_tracklets(
+    problem: SlamProblem, config: SlamConfig, noise: NoiseModel, prior: FeaturePrior, tracklets: Tracklets
+) -> SlamState:
+    """The second half of `init`, for tracklets that came from elsewhere (the online tracker)."""
+    static = np.flatnonzero(~tracklets.moving)
+    number = np.full(len(tracklets) + 1, -1)
+    number[static] = np.arange(len(static))
+    landmark = number[tracklets.of_observation]
+    rows = np.flatnonzero(landmark >= 0)
+    landmark, weight = landmark[rows], tracklets.weight[rows]
+    distance = np.linalg.norm(problem.observations.position, axis=1)
+    state = SlamState(
+        problem=problem, config=config, noise=noise, prior=prior, tracklets=tracklets, static=static, rows=rows,
+        landmark=landmark, weight=weight,
+        features=tracklet_features(problem, noise, config, prior, rows, landmark, weight, len(static)),
+        estimate=first_estimate(problem, noise, config, rows, landmark, len(static)), links=Links.none(),
+        typical_range=float(np.median(distance)) if len(distance) else 1.0,
+    )
+    for repeat in range(3):
+        estimate, _, error = optimise(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
+        state = replace(state, estimate=estimate, graph_error=error)
+        if repeat == 0:
+            state = calibrate(state)
+        state = replace(state, weight=inlier_weights(state))
+        if repeat == 0:
+            state = odometry_by_evidence(state)
+    return state

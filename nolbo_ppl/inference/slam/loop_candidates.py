@@ -1,0 +1,202 @@
+"""Evidence that two tracklets are one object: position gap under the graph's own relative covariance, latent, orientation.
+
+The covariance between any two tracklets comes from posterior samples of the linearised graph. It holds the drift
+between two passes of a place; the sensor's covariance alone closes no loop after drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, latent_log_density
+from nolbo_ppl.inference.slam.gaussian import squared_distance
+from nolbo_ppl.inference.slam.graph import Estimate, Linearisation
+from nolbo_ppl.inference.slam.orientation import orientation_log_density
+from nolbo_ppl.inference.slam.slam_problem import SlamConfig
+
+POSITION_GATE = 25.0
+"""Squared Mahalanobis distance beyond which two tracklets are no candidates."""
+
+
+@dataclass(frozen=True)
+class TrackletFeatures:
+    """What is known of each tracklet besides its position."""
+
+    latent: Float[np.ndarray, "m d"]
+    """Posterior mean of the latent."""
+    latent_variance: Float[np.ndarray, "m d"]
+    """Its variance; LARGE_VARIANCE where none was observed."""
+    log_population: Float[np.ndarray, " m"]
+    """Log density of its latent in the population of the others."""
+    category: Int[np.ndarray, " m"]
+    """Most frequent category, -1 for none."""
+    symmetry: Int[np.ndarray, " m"]
+    """Symmetry order."""
+    oriented: Bool[np.ndarray, " m"]
+    """Whether its orientation was observed."""
+    first: Int[np.ndarray, " m"]
+    """First frame."""
+    last: Int[np.ndarray, " m"]
+    """Last frame."""
+
+
+@dataclass(frozen=True)
+class PosteriorSamples:
+    """World-frame samples of the tracklets about the estimate."""
+
+    position: Float[np.ndarray, "m 3 s"]
+    """Deviations of positions, m."""
+    rotation: Float[np.ndarray, "m 3 s"]
+    """Deviations of orientations as rotation vectors, rad."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Candidate pairs of a newer and an older tracklet."""
+
+    a: Int[np.ndarray, " p"]
+    """Newer tracklet."""
+    b: Int[np.ndarray, " p"]
+    """Older tracklet."""
+    log_position: Float[np.ndarray, " p"]
+    """Log density of the position gap, m^-3."""
+    log_feature: Float[np.ndarray, " p"]
+    """Log ratio of latent, category and orientation against the population."""
+
+    def select(self, rows: np.ndarray) -> Pairs:
+        """Some of the pairs."""
+        return Pairs(self.a[rows], self.b[rows], self.log_position[rows], self.log_feature[rows])
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+
+def log_population(
+    latent: Float[np.ndarray, "m d"], variance: Float[np.ndarray, "m d"], rows: Int[np.ndarray, " r"] | None = None
+) -> Float[np.ndarray, " m"]:
+    """Log density of each latent in the kernel mixture `1/(M-1) sum_c N(.; c, own + c's variance)` of all others.
+
+    With `rows` only theirs are computed; the rest is 0.
+    """
+    m, d = latent.shape
+    out = np.zeros(m)
+    members = np.flatnonzero(variance[:, 0] < LARGE_VARIANCE) if d else np.zeros(0, int)
+    if len(members) < 2:
+        return out
+    for i in members if rows is None else np.intersect1d(members, rows):
+        others = members[members != i]
+        density = latent_log_density(latent[i], latent[others], variance[i] + variance[others])
+        out[i] = np.logaddexp.reduce(density) - np.log(len(members) - 1)
+    return out
+
+
+def posterior_samples(
+    linearisation: Linearisation, estimate: Estimate, count: int, rng: np.random.Generator
+) -> PosteriorSamples:
+    """Samples of all tracklets in the world frame."""
+    _, delta = linearisation.samples(count, rng)
+    R = estimate.T_world_landmark[:, :3, :3]
+    return PosteriorSamples(np.einsum("mij,mjs->mis", R, delta[:, 3:]), np.einsum("mij,mjs->mis", R, delta[:, :3]))
+
+
+def gap_covariance(
+    samples: PosteriorSamples, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
+) -> Float[np.ndarray, "p 3 3"]:
+    """Covariance of the position of a less that of b, m^2."""
+    out = np.empty((len(a), 3, 3))
+    count = samples.position.shape[2]
+    for start in range(0, len(a), 20000):
+        part = slice(start, start + 20000)
+        deviation = samples.position[a[part]] - samples.position[b[part]]
+        out[part] = deviation @ np.swapaxes(deviation, 1, 2) / count
+    return out
+
+
+def candidate_pairs(
+    estimate: Estimate, samples: PosteriorSamples, features: TrackletFeatures, prior: FeaturePrior, config: SlamConfig,
+    *, inflation: float, floor: float,
+) -> Pairs:
+    """All pairs (newer, older) that are never seen together and whose gap is inside the gate, with their evidence.
+
+    Args:
+        inflation: factor on the sampled covariances (annealing).
+        floor: standard deviation added to each coordinate of the gap, m (what one object's position varies by).
+    """
+    position = estimate.T_world_landmark[:, :3, 3]
+    m, _, count = samples.position.shape
+    empty = np.zeros(0, dtype=np.int64)
+    if m < 2:
+        return Pairs(empty, empty, np.zeros(0), np.zeros(0))
+    flat = samples.position.reshape(m, -1)
+    norm = np.sum(flat**2, axis=1)
+    square = np.sum(position**2, axis=1)
+    lists_a, lists_b = [], []
+    for start in range(0, m, 512):
+        rows = np.arange(start, min(start + 512, m))
+        trace = (norm[rows, None] + norm[None] - 2 * flat[rows] @ flat.T) / count
+        distance = square[rows, None] + square[None] - 2 * position[rows] @ position.T
+        near = distance <= POSITION_GATE * (np.maximum(trace, 0) * inflation + 3 * floor**2)
+        near &= features.last[None] < features.first[rows, None]
+        i, j = np.nonzero(near)
+        lists_a.append(rows[i])
+        lists_b.append(j)
+    a, b = np.concatenate(lists_a), np.concatenate(lists_b)
+    compatible = prior.category_log_ratio(features.category[a], features.category[b]) > -20
+    a, b = a[compatible], b[compatible]
+    covariance = inflation * gap_covariance(samples, a, b) + floor**2 * np.eye(3)
+    gap = position[a] - position[b]
+    square, log_det = squared_distance(gap, covariance)
+    inside = square < POSITION_GATE
+    a, b = a[inside], b[inside]
+    log_position = -0.5 * (square + log_det)[inside]
+    return Pairs(a, b, log_position, feature_log_ratio(estimate, samples, features, prior, config, a, b))
+
+
+def feature_log_ratio(
+    estimate: Estimate, samples: PosteriorSamples, features: TrackletFeatures, prior: FeaturePrior, config: SlamConfig,
+    a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Log ratio of a's latent, category and orientation given that it is b to those of any object, nats."""
+    ratio = prior.category_log_ratio(features.category[b], features.category[a])
+    if features.latent.shape[1]:
+        va, vb = features.latent_variance[a], features.latent_variance[b]
+        known = (va[:, 0] < LARGE_VARIANCE) & (vb[:, 0] < LARGE_VARIANCE)
+        latent = latent_log_density(features.latent[a], features.latent[b], va + vb) - features.log_population[a]
+        ratio = np.where(known, latent + np.minimum(ratio, 0.0), ratio)
+    both = np.flatnonzero(features.oriented[a] & features.oriented[b])
+    if len(both):
+        ratio[both] += _orientation_log_ratio(estimate, samples, features, config, a[both], b[both])
+    return ratio
+
+
+def _orientation_log_ratio(
+    estimate: Estimate,
+    samples: PosteriorSamples,
+    features: TrackletFeatures,
+    config: SlamConfig,
+    a: np.ndarray,
+    b: np.ndarray,
+) -> np.ndarray:
+    R = estimate.T_world_landmark[:, :3, :3]
+    scale = np.empty(len(a))
+    for start in range(0, len(a), 20000):
+        part = slice(start, start + 20000)
+        deviation = samples.rotation[a[part]] - samples.rotation[b[part]]
+        scale[part] = np.sqrt(np.mean(deviation**2, axis=(1, 2)) + 0.02**2)
+    log_density = orientation_log_density(R[b], R[a], scale, features.symmetry[a], config)
+    # The population of orientations: every k-th tracklet, seen with the same uncertainty as the pair's.
+    oriented = np.flatnonzero(features.oriented)
+    others = oriented[:: max(1, len(oriented) // 60)]
+    rows, inverse = np.unique(a, return_inverse=True)
+    typical = np.zeros(len(rows))
+    np.maximum.at(typical, inverse, scale)
+    grid_a, grid_c = np.repeat(rows, len(others)), np.tile(others, len(rows))
+    population = orientation_log_density(R[grid_c], R[grid_a], np.repeat(typical, len(others)),
+                                         features.symmetry[grid_a], config).reshape(len(rows), len(others))
+    population = np.where(others[None] == rows[:, None], -np.inf, population)
+    log_population = np.logaddexp.reduce(population, axis=1) - np.log(max(len(others), 1))
+    from_uniform = orientation_log_density(R[a], R[a], np.full(len(a), 1e3), features.symmetry[a], config)
+    return log_density - np.maximum(log_population[inverse], from_uniform)

@@ -1,0 +1,141 @@
+"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, every detection associated anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from jaxtyping import Int
+
+from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
+from nolbo_ppl.inference.slam.data_association import Associations, associate_detections
+from nolbo_ppl.inference.slam.em import make_links
+from nolbo_ppl.inference.slam.graph import Estimate, Links, linearise, optimise
+from nolbo_ppl.inference.slam.initialise import (
+    SlamState,
+    base_graph,
+    first_estimate,
+    inlier_weights,
+    linearise_state,
+    tracklet_features,
+)
+from nolbo_ppl.inference.slam.loop_candidates import candidate_pairs, posterior_samples
+from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
+from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
+
+MERGE_LOG_ODDS = 3.0
+"""Two landmarks are merged in the end when one explains them better by this many nats."""
+BROKEN_LINK = 6.0
+"""A link stretched to this many of its scales by the others is cut."""
+
+
+def surviving_links(state: SlamState) -> Links:
+    """Links that the robust solution keeps: those it stretches far are contradicted by the rest."""
+    links = state.links
+    position = state.estimate.T_world_landmark[:, :3, 3]
+    stretch = np.linalg.norm(position[links.a] - position[links.b], axis=1) / np.maximum(links.scale[:, 1], 1e-12)
+    keep = stretch < BROKEN_LINK
+    return Links(links.a[keep], links.b[keep], links.weight[keep], links.T_a_b[keep], links.scale[keep])
+
+
+def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
+    """The same problem with landmarks joined: numbering, features, first positions from the current poses."""
+    count = int(cluster.max(initial=-1)) + 1
+    landmark = cluster[state.landmark]
+    moved = replace(state.problem, odometry=state.estimate.T_world_camera)
+    estimate = first_estimate(moved, state.noise, state.config, state.rows, landmark, count)
+    features = tracklet_features(
+        state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count
+    )
+    return replace(state, landmark=landmark, static=np.arange(count), features=features, links=Links.none(), closed={},
+                   estimate=Estimate(state.estimate.T_world_camera, estimate.T_world_landmark))
+
+
+def solve_clean(state: SlamState, repeats: int = 3, tolerance: float = 1e-8) -> SlamState:
+    """Solve without kernels; between solves only the frozen weights of detections change."""
+    for _ in range(repeats):
+        estimate, _, error = optimise(base_graph(state), state.estimate, iterations=30, relative_tolerance=tolerance)
+        state = replace(state, estimate=estimate, graph_error=error)
+        weight = inlier_weights(state)
+        settled = np.abs(weight - state.weight).max(initial=0.0) < 0.02
+        state = replace(state, weight=weight)
+        if settled:
+            break
+    return state
+
+
+def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
+    """Join landmarks that one explains better: never seen together, close under the final covariance, alike."""
+    samples = posterior_samples(linearise_state(state), state.estimate, state.config.samples, rng)
+    frames = frames_of_landmarks(state)
+    spans = replace(state.features, first=np.arange(len(frames)), last=np.arange(len(frames)))  # every pair once
+    pairs = candidate_pairs(
+        state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale
+    )
+    value = pairs.log_position + pairs.log_feature - np.log(state.noise.new_rate)
+    apart = np.array([frames[i].isdisjoint(frames[j]) for i, j in zip(pairs.a, pairs.b)], dtype=bool)
+    good = np.flatnonzero((value > MERGE_LOG_ODDS) & apart)
+    if not len(good):
+        return state
+    weight = 1.0 / (1.0 + np.exp(-np.minimum(value[good], 30.0)))
+    links = make_links(state, pairs.a[good], pairs.b[good], weight)
+    return relabel(state, join(links, frames, 0.5))
+
+
+def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, Associations]:
+    """E-step of every detection against the map; detections join or leave landmarks by it, empty landmarks go."""
+    graph = base_graph(state)
+    found = associate_detections(state.problem, state.noise, state.config, state.prior, state.estimate, state.features,
+                                 linearise(graph, state.estimate), rng)
+    best = np.full(len(state.problem.observations), -1)
+    weight = np.zeros(len(best))
+    order = np.argsort(found.weight, kind="stable")
+    best[found.row[order]], weight[found.row[order]] = found.landmark[order], found.weight[order]
+    rows = np.flatnonzero(weight > 0.5)
+    moving = np.zeros(len(best), dtype=bool)
+    tracks = state.tracklets.of_observation
+    moving[tracks >= 0] = state.tracklets.moving[tracks[tracks >= 0]]
+    rows = rows[~moving[rows]]
+    return replace(state, rows=rows, landmark=best[rows], weight=weight[rows]), found
+
+
+def drop_empty(state: SlamState, minimum: float) -> SlamState:
+    """Remove landmarks whose weights sum to less than `minimum`."""
+    total = np.bincount(state.landmark, weights=state.weight, minlength=len(state.static))
+    keep = total >= minimum
+    number = np.where(keep, np.cumsum(keep) - 1, -1)
+    rows = number[state.landmark] >= 0
+    landmark = number[state.landmark[rows]]
+    count = int(keep.sum())
+    state = replace(state, rows=state.rows[rows], landmark=landmark, weight=state.weight[rows], static=np.arange(count),
+                    estimate=Estimate(state.estimate.T_world_camera, state.estimate.T_world_landmark[keep]))
+    features = tracklet_features(
+        state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count
+    )
+    return replace(state, features=features)
+
+
+def finish(state: SlamState) -> tuple[SlamState, Associations]:
+    """Merge, solve clean, associate every detection with the map, solve again: the final state and its associations."""
+    rng = np.random.default_rng([state.config.seed, 104729])
+    links = surviving_links(state)
+    cluster = join(links, frames_of_landmarks(state), state.config.merge_weight)
+    state = solve_clean(relabel(state, cluster), repeats=2, tolerance=1e-5)
+    # Several passes of one object show what one track cannot: how far the detector errs from view to view.
+    state = calibrate(state)
+    state = merge_duplicates(solve_clean(state, repeats=2, tolerance=1e-5), rng)
+    state = solve_clean(state)
+    state, _ = reassociate(state, rng)
+    state = drop_empty(state, 0.5)
+    state = solve_clean(state, repeats=2)
+    if len(state.rows):
+        state = refine_odometry(state, linearise_state(state))
+        state = solve_clean(state, repeats=1)
+    _, found = reassociate(state, rng)
+    return state, found
+
+
+def final_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
+    """The graph of the final state."""
+    return base_graph(state)

@@ -1,0 +1,275 @@
+"""Noise scales from the data: consecutive detections of one object tell the detector's scales before any map exists."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.geometry.pose import relative, so3_log, transform
+from nolbo_ppl.inference.slam.orientation import nearest_of_modes, observed_modes, resolved_symmetry
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.io.observations import ObservationTable
+
+MAD_TO_SCALE = 1.4826
+"""Standard deviation of a normal variable over its median absolute deviation."""
+
+DEFAULT_ROTATION_STEP = 0.004
+"""Standard deviation of each angle of an odometry step where nothing is stated, rad (refined on the graph)."""
+DEFAULT_TRANSLATION_RATIO = 0.02
+"""The same for its translation, m per m."""
+TOO_SMALL = 1.35
+"""A stated scale is called too small when normalised residuals are this wide."""
+
+
+@dataclass(frozen=True)
+class DetectionPairs:
+    """Detections of (very likely) the same object in two consecutive frames."""
+
+    first: Int[np.ndarray, " p"]
+    """Rows of the earlier detections."""
+    second: Int[np.ndarray, " p"]
+    """Rows of the later ones."""
+    residual: Float[np.ndarray, "p 3"]
+    """Position of the second less the first carried over by odometry, in the second camera frame, m."""
+
+
+def consecutive_pairs(problem: SlamProblem, maximum: int = 4000) -> DetectionPairs:
+    """Mutual nearest neighbours between consecutive frames, categories equal, in the odometry frame."""
+    table = problem.observations
+    order = np.argsort(table.frame, kind="stable")
+    frames, starts = np.unique(table.frame[order], return_index=True)
+    groups = np.split(order, starts[1:])
+    label = np.unique([c or "" for c in table.category], return_inverse=True)[1] if len(table) else np.zeros(0, int)
+    first, second, residual = [], [], []
+    stride = max(1, int(len(table) / max(maximum, 1)))
+    for g in range(0, len(frames) - 1, stride):
+        if frames[g + 1] - frames[g] > 2:
+            continue
+        a, b = groups[g], groups[g + 1]
+        carried = transform(relative(problem.odometry[frames[g + 1]], problem.odometry[frames[g]]), table.position[a])
+        gap = table.position[b][None] - carried[:, None]
+        distance = np.linalg.norm(gap, axis=2) + 1e6 * (label[a][:, None] != label[b][None])
+        i = np.argmin(distance, axis=0)  # the nearest a of each b
+        mutual = (np.argmin(distance, axis=1)[i] == np.arange(len(b))) & (distance[i, np.arange(len(b))] < 1e5)
+        first.append(a[i[mutual]])
+        second.append(b[mutual])
+        residual.append(gap[i[mutual], np.arange(len(b))[mutual]])
+    if not first:
+        return DetectionPairs(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
+    return _without_strangers(DetectionPairs(np.concatenate(first), np.concatenate(second), np.concatenate(residual)))
+
+
+def _without_strangers(pairs: DetectionPairs) -> DetectionPairs:
+    """Drop pairs whose distance is far outside the bulk (clutter, other objects)."""
+    distance = np.linalg.norm(pairs.residual, axis=1)
+    keep = np.ones(len(distance), dtype=bool)
+    for _ in range(5):
+        if not keep.any():
+            break
+        keep = distance <= 4.0 * np.median(distance[keep]) + 1e-9
+    return DetectionPairs(pairs.first[keep], pairs.second[keep], pairs.residual[keep])
+
+
+def robust_scale(values: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of the bulk about zero by the median absolute value; NaN without values."""
+    return float(MAD_TO_SCALE * np.median(np.abs(values))) if len(values) else float("nan")
+
+
+def fit_range_model(
+    distance: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"], bins: int = 4
+) -> tuple[float, float]:
+    """Standard deviation `a + b * range` of single detections from differences `value` of two, by range quantile.
+
+    Both are non-negative; the model never falls below a quarter of the overall scale.
+    """
+    overall = robust_scale(value) / np.sqrt(2)
+    if len(value) < 20 * bins:
+        return overall, 0.0
+    edges = np.quantile(distance, np.linspace(0, 1, bins + 1))
+    which = np.clip(np.searchsorted(edges, distance, side="right") - 1, 0, bins - 1)
+    centre = np.array([np.median(distance[which == k]) for k in range(bins) if (which == k).any()])
+    scale = np.array([robust_scale(value[which == k]) / np.sqrt(2) for k in range(bins) if (which == k).any()])
+    design = np.stack([np.ones_like(centre), centre], axis=1) / scale[:, None]
+    a, b = np.linalg.lstsq(design, np.ones(len(scale)), rcond=None)[0]
+    if b < 0:
+        return float(overall), 0.0
+    return float(max(a, 0.25 * overall if b == 0 else 0.02 * overall)), float(b)
+
+
+def ray_covariance(
+    position: Float[np.ndarray, "n 3"], lateral: Float[np.ndarray, " n"], radial: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """Covariance with one scale along the ray and another across it, m^2."""
+    distance = np.linalg.norm(position, axis=1, keepdims=True)
+    ray = np.where(distance > 1e-9, position / np.maximum(distance, 1e-9), np.array([0.0, 0.0, 1.0]))
+    along = ray[:, :, None] * ray[:, None, :]
+    return lateral[:, None, None] ** 2 * (np.eye(3) - along) + radial[:, None, None] ** 2 * along
+
+
+def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
+    """Every scale in use: stated by observation, else by configuration, else estimated; too small ones are reported.
+
+    Odometry scales nobody stated start from defaults here and are refined on the graph (`refine_odometry`).
+    """
+    table = problem.observations
+    pairs = consecutive_pairs(problem)
+    report: dict[str, float] = {"pairs": float(len(pairs.first))}
+    warnings: list[str] = []
+    covariance = _position_covariance(table, pairs, config, report, warnings)
+    rotation_scale = _rotation_scale(problem, pairs, config, report, warnings)
+    latent_scale = _latent_scale(table, pairs, config, report, warnings)
+    rotation_step, translation_step, correlation = step_scales(problem, config)
+    volume = view_volume(table)
+    seen = max(len(np.unique(table.frame)), 1)
+    rate = len(table) / seen / volume if len(table) else 1.0
+    return NoiseModel(
+        rotation_step=rotation_step, translation_step=translation_step, position_covariance=covariance,
+        rotation_scale=rotation_scale, latent_scale=latent_scale,
+        new_rate=config.new_rate if config.new_rate is not None else 0.2 * rate,
+        clutter_rate=config.clutter_rate if config.clutter_rate is not None else 0.1 * rate,
+        report=report, warnings=tuple(warnings), step_correlation=correlation,
+    )
+
+
+def step_scales(
+    problem: SlamProblem, config: SlamConfig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 6 6"] | None]:
+    """Scales of each step, and its covariance in units of them where the problem states it."""
+    covariance = problem.odometry_covariance
+    if covariance is None:
+        length = np.linalg.norm(np.diff(problem.odometry[:, :3, 3], axis=0), axis=1)
+        return *odometry_scales(length, config), None
+    rotation, translation = (np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3)
+                             for part in (slice(3), slice(3, 6)))
+    scale = np.repeat(np.stack([rotation, translation], axis=1), 3, axis=1)
+    return rotation, translation, covariance / scale[:, :, None] / scale[:, None, :]
+
+
+def odometry_scales(
+    length: Float[np.ndarray, " n"], config: SlamConfig
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances."""
+    typical = float(np.sqrt(np.mean(length**2))) if len(length) else 1.0
+    typical = max(typical, 1e-3)
+    rotation = DEFAULT_ROTATION_STEP if config.odometry_rotation_scale is None else config.odometry_rotation_scale
+    constant, ratio = config.odometry_translation_scale, config.odometry_translation_ratio
+    if constant is None and ratio is None:
+        ratio = DEFAULT_TRANSLATION_RATIO
+        constant = 0.3 * ratio * typical
+    constant, ratio = constant or 0.0, ratio or 0.0
+    translation = np.sqrt(constant**2 + (ratio * length) ** 2)
+    return np.full(len(length), max(rotation, 1e-6)), np.maximum(translation, 1e-4 * typical)
+
+
+def view_volume(table: ObservationTable) -> float:
+    """Volume detections come from, m^3: that of the ellipsoid uniform points of this covariance would fill."""
+    if len(table) < 5:
+        return 1000.0
+    covariance = np.cov(table.position.T) + 1e-6 * np.eye(3)
+    return float(4.0 / 3.0 * np.pi * 5.0**1.5 * np.sqrt(np.linalg.det(covariance)))
+
+
+def _ray_parts(position: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residual along the ray [n] and across it [n, 3]."""
+    ray = position / np.maximum(np.linalg.norm(position, axis=1, keepdims=True), 1e-9)
+    along = np.sum(ray * residual, axis=1)
+    return along, residual - along[:, None] * ray
+
+
+def _position_covariance(
+    table: ObservationTable, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
+) -> np.ndarray:
+    given = np.isfinite(table.position_covariance).all(axis=(1, 2))
+    distance = np.linalg.norm(table.position, axis=1)
+    along, across = _ray_parts(table.position[pairs.second], pairs.residual)
+    at = distance[pairs.second]
+    if config.position_scale is not None or config.position_ratio is not None:
+        lateral = radial = np.maximum((config.position_scale or 0.0) + (config.position_ratio or 0.0) * distance, 1e-6)
+    elif len(pairs.first) >= 5:
+        # Across the ray two components are left: their length is Rayleigh, its median 1.1774 scales.
+        length = np.linalg.norm(across, axis=1) * (1 / 1.1774 / MAD_TO_SCALE)
+        a_lateral, b_lateral = fit_range_model(at, length)
+        a_radial, b_radial = fit_range_model(at, along)
+        report.update(position_lateral=a_lateral, position_lateral_ratio=b_lateral, position_radial=a_radial,
+                      position_radial_ratio=b_radial)
+        # Errors of one object in following frames are alike (same view), so differences understate them.
+        lateral, radial = 1.2 * (a_lateral + b_lateral * distance), 1.2 * (a_radial + b_radial * distance)
+    else:
+        lateral = radial = 0.05 * distance + 1e-3
+    floor = 1e-4 * max(float(np.median(distance)) if len(distance) else 1.0, 1e-3)
+    estimated = ray_covariance(table.position, np.maximum(lateral, floor), np.maximum(radial, floor))
+    covariance = np.where(given[:, None, None], np.nan_to_num(table.position_covariance), estimated)
+    both = given[pairs.first] & given[pairs.second] if len(pairs.first) else np.zeros(0, bool)
+    if both.sum() >= 30:
+        variance = np.trace(covariance[pairs.first] + covariance[pairs.second], axis1=1, axis2=2)[both] / 3
+        ratio = robust_scale((pairs.residual[both] / np.sqrt(variance)[:, None]).ravel())
+        report["position_ratio_to_stated"] = ratio
+        if ratio > TOO_SMALL:
+            warnings.append(f"stated position scales are too small: residuals are {ratio:.2f} times as wide")
+            if config.correct_scales:
+                covariance = np.where(given[:, None, None], covariance * ratio**2, covariance)
+    return covariance
+
+
+def _rotation_scale(
+    problem: SlamProblem, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
+) -> np.ndarray:
+    table = problem.observations
+    scale = table.rotation_scale.copy()
+    both = table.has_rotation[pairs.first] & table.has_rotation[pairs.second] if len(pairs.first) else np.zeros(0, bool)
+    default = config.rotation_scale
+    if both.sum() >= 5:
+        i, j = pairs.first[both], pairs.second[both]
+        carried = (
+            relative(problem.odometry[table.frame[j]], problem.odometry[table.frame[i]])[:, :3, :3] @ table.rotation[i]
+        )
+        symmetry = resolved_symmetry(table, config)
+        observed = nearest_of_modes(carried, observed_modes(table, np.ones(len(table)), j), symmetry[j])
+        error = so3_log(np.swapaxes(carried, 1, 2) @ observed)
+        error[symmetry[j] == 0, 2] = np.nan
+        values = error[np.isfinite(error)]
+        # A third of detectors' angles are nearly constrained (upright objects): the widest axis is the scale.
+        widest = max(robust_scale(error[:, k][np.isfinite(error[:, k])]) for k in range(3)
+                     if np.isfinite(error[:, k]).any()) / np.sqrt(2)
+        report["rotation_scale"] = widest
+        if default is None:
+            default = max(1.2 * widest, 1e-3)
+        stated = np.isfinite(scale[i]) & np.isfinite(scale[j])
+        if stated.sum() >= 30:
+            width = np.sqrt(scale[i] ** 2 + scale[j] ** 2)[:, None]
+            normalised = (error / width)[stated]
+            ratio = robust_scale(normalised[np.isfinite(normalised)])
+            report["rotation_ratio_to_stated"] = ratio
+            if ratio > TOO_SMALL and len(values):
+                warnings.append(f"stated rotation scales are too small: residuals are {ratio:.2f} times as wide")
+                if config.correct_scales:
+                    scale = scale * ratio
+    return np.where(np.isfinite(scale), scale, 0.1 if default is None else default)
+
+
+def _latent_scale(
+    table: ObservationTable, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
+) -> np.ndarray:
+    scale = table.latent_scale.copy()
+    if not table.latent_dim:
+        return scale
+    default = config.latent_scale
+    both = table.has_latent[pairs.first] & table.has_latent[pairs.second] if len(pairs.first) else np.zeros(0, bool)
+    if both.sum() >= 5:
+        i, j = pairs.first[both], pairs.second[both]
+        difference = table.latent[j] - table.latent[i]
+        measured = robust_scale(difference.ravel()) / np.sqrt(2)
+        report["latent_scale"] = measured
+        if default is None:
+            default = max(measured, 1e-6)
+        stated = np.isfinite(scale[i]).all(axis=1) & np.isfinite(scale[j]).all(axis=1)
+        if stated.sum() >= 30:
+            ratio = robust_scale((difference / np.sqrt(scale[i] ** 2 + scale[j] ** 2))[stated].ravel())
+            report["latent_ratio_to_stated"] = ratio
+            if ratio > TOO_SMALL:
+                warnings.append(f"stated latent scales are too small: residuals are {ratio:.2f} times as wide")
+                if config.correct_scales:
+                    scale = scale * ratio
+    return np.where(np.isfinite(scale), scale, 1.0 if default is None else default)

@@ -1,0 +1,171 @@
+"""Settings of the object SLAM, and the problem it solves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from nolbo_ppl.categories import CATEGORY_SYMMETRY
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import is_rotation
+from nolbo_ppl.inference.association.marginals import Associator
+from nolbo_ppl.io.observations import ObservationTable, check_table
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """How objects are tracked, associated and mapped. None: estimated from the data."""
+
+    odometry_rotation_scale: float | None = None
+    """Standard deviation of each angle of one odometry step, rad."""
+    odometry_translation_scale: float | None = None
+    """Standard deviation of each coordinate of one odometry step, m."""
+    odometry_translation_ratio: float | None = None
+    """The part of it that grows with the length of the step, m per m."""
+    position_scale: float | None = None
+    """Standard deviation of an observed position at range 0, m, for observations that state none."""
+    position_ratio: float | None = None
+    """Its growth with range, m per m."""
+    rotation_scale: float | None = None
+    """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
+    latent_scale: float | None = None
+    """Standard deviation of a latent coordinate, for observations that state none."""
+    latent_correlation: float | None = None
+    """Correlation of the latent's errors in two detections of one object. None: 0, and in a run from images what the model's
+    calibration says. Without it many views of one side would pass for certainty about the whole shape."""
+    new_rate: float | None = None
+    """Density of landmarks not seen before, per m^3 of the observed space."""
+    clutter_rate: float | None = None
+    """Density of false detections, per m^3 of the observed space and frame."""
+    objectness_limits: tuple[float, float] = (0.02, 0.98)
+    """Objectness is clipped to this, so that background always remains possible."""
+    correct_scales: bool = True
+    """Raise stated scales that the data show to be too small (always reported)."""
+    flip_probability: float = 0.03
+    """Prior probability that an orientation is turned by 180 degrees about the object's vertical axis."""
+    orientation_outlier: float = 0.05
+    """Prior probability that an orientation says nothing."""
+    category_error: float = 0.05
+    """Prior probability that a category is wrong."""
+    category_symmetry: Mapping[str, int] = field(default_factory=lambda: dict(CATEGORY_SYMMETRY))
+    """Symmetry about the object's vertical axis by category, where an observation declares none."""
+    track_gap: int = 8
+    """A short-term track ends after this many frames without a detection."""
+    track_minimum: int = 2
+    """Tracks with fewer detections found no landmark."""
+    motion_log_odds: float = 8.0
+    """A track whose motion is favoured by more than this many nats is moving, and not used."""
+    samples: int = 64
+    """Posterior samples of the linearised graph that carry all relative covariances."""
+    annealing: tuple[float, ...] = (4.0, 2.0, 1.0)
+    """Factors on the relative covariances in the first rounds; the last one stays."""
+    constellation_size: int = 14
+    """Tracklets a fresh constellation is made of."""
+    constellation_minimum: int = 3
+    """Pairs that must agree to close a loop by constellation."""
+    constellation_log_odds: float = 8.0
+    """Log evidence, in nats above new landmarks, that a constellation must reach."""
+    constellation_rounds: int = 8
+    """Most rounds of constellation closing."""
+    em_iterations: int = 4
+    """Iterations of the soft EM between tracklets after that."""
+    link_minimum: float = 0.02
+    """Links of lower weight are left out of the M-step."""
+    merge_weight: float = 0.5
+    """Tracklets linked by more than this become one landmark."""
+    robust_width: float = 1.0
+    """Width of the Cauchy kernel on links between tracklets, in standard deviations."""
+    seed: int = 0
+    """Seed of the posterior samples."""
+    associator: Associator = "exact"
+    """How association marginals are computed (see `nolbo_ppl.inference.association`)."""
+
+    def __post_init__(self) -> None:
+        if self.latent_correlation is not None and not 0 <= self.latent_correlation < 1:
+            raise input_error("latent_correlation", got=self.latent_correlation, expected="a correlation from 0 to below 1")
+
+
+def check_step_covariance(covariance: np.ndarray, steps: int) -> None:
+    """Refuse covariances of odometry steps that no graph can use.
+
+    Raises:
+        InputError: a wrong shape, or a row that is not finite, not symmetric, or not positive definite.
+    """
+    if covariance.shape != (steps, 6, 6):
+        raise input_error("odometry covariance has the wrong shape", got=covariance.shape, expected=(steps, 6, 6),
+                          do="give one 6 x 6 matrix a step, [rotation rad, translation m]")
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    usable = np.where(finite[:, None, None], covariance, np.eye(6))
+    largest = np.abs(usable).max(axis=(1, 2), initial=0)
+    symmetric = np.abs(usable - np.swapaxes(usable, 1, 2)).max(axis=(1, 2), initial=0) <= 1e-6 * largest
+    # Rotations and translations have units of their own: their correlation is what must be positive definite.
+    scale = np.sqrt(np.maximum(np.diagonal(usable, axis1=1, axis2=2), 1e-300))
+    correlation = usable / scale[:, :, None] / scale[:, None, :]
+    positive = np.linalg.eigvalsh(np.where(symmetric[:, None, None], correlation, np.eye(6)))[:, 0] > 1e-9
+    for good, what in ((finite, "finite"), (symmetric, "symmetric"), (positive, "positive definite")):
+        if not good.all():
+            row = int(np.argmin(good))
+            raise input_error(f"odometry covariance of step {row} (rows {row} to {row + 1}) is not {what}", got=covariance[row])
+
+
+@dataclass(frozen=True)
+class SlamProblem:
+    """Odometry and observations of one drive."""
+
+    odometry: Float[np.ndarray, "n 4 4"]
+    """Drifting T_world_camera, one row a frame."""
+    observations: ObservationTable
+    """Detections in these frames, rows in any order."""
+    odometry_covariance: Float[np.ndarray, "n-1 6 6"] | None = None
+    """Covariance of every odometry step, [rotation rad, translation m] in the tangent space of T_earlier_later at the later
+    camera (GTSAM's Pose3); None: scales of the configuration, or of the data."""
+
+    def __post_init__(self) -> None:
+        T = self.odometry
+        if T.ndim != 3 or T.shape[1:] != (4, 4) or len(T) == 0:
+            raise input_error("odometry is no trajectory", got=f"shape {T.shape}", expected="[n, 4, 4], n at least 1")
+        bad = ~np.isfinite(T).all(axis=(1, 2)) | ~is_rotation(np.nan_to_num(T[:, :3, :3]))
+        if bad.any():
+            raise input_error("odometry holds a row that is no pose", got=T[int(np.argmax(bad))],
+                              expected="finite, orthonormal", do=f"look at row {int(np.argmax(bad))}")
+        if self.odometry_covariance is not None:
+            check_step_covariance(self.odometry_covariance, len(T) - 1)
+        check_table(self.observations, len(T))
+
+    def __len__(self) -> int:
+        return len(self.odometry)
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """The standard deviations in use, after estimation and correction."""
+
+    rotation_step: Float[np.ndarray, " n-1"]
+    """Standard deviation of each angle of each odometry step, rad."""
+    translation_step: Float[np.ndarray, " n-1"]
+    """Standard deviation of each coordinate of each odometry step, m."""
+    position_covariance: Float[np.ndarray, "k 3 3"]
+    """Covariance of every observed position in its camera frame, m^2."""
+    rotation_scale: Float[np.ndarray, " k"]
+    """Standard deviation of every observed angle, rad."""
+    latent_scale: Float[np.ndarray, "k d"]
+    """Standard deviation of every latent coordinate."""
+    new_rate: float
+    """Landmarks not seen before, per m^3."""
+    clutter_rate: float
+    """False detections, per m^3 and frame."""
+    report: dict[str, float]
+    """Estimated values by name."""
+    warnings: tuple[str, ...] = ()
+    """Stated scales found too small, in words."""
+    position_factor: float = 1.0
+    """Factor on position covariances in the graph, across the ray, for errors that resemble one another from frame to frame."""
+    range_factor: float = 1.0
+    """The same along the ray: depth is what detectors are biased in."""
+    rotation_factor: float = 1.0
+    """The same for orientations."""
+    step_correlation: Float[np.ndarray, "n-1 6 6"] | None = None
+    """Covariance of each odometry step in units of its scales, where the problem states covariances."""

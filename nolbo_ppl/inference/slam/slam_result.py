@@ -1,0 +1,152 @@
+"""The answers: trajectory and map with uncertainty, and the questions users ask of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import inverse, transform
+from nolbo_ppl.inference.slam.data_association import Associations
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, category_index
+from nolbo_ppl.inference.slam.em import StepInfo
+from nolbo_ppl.inference.slam.gaussian import log_normal
+from nolbo_ppl.inference.slam.graph import Estimate, Linearisation, linearise
+from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, Voxels, decode_landmarks
+from nolbo_ppl.inference.slam.map_refinement import final_graph
+from nolbo_ppl.inference.slam.slam_state import SlamState
+from nolbo_ppl.structures.landmark import Landmark
+
+
+@dataclass(frozen=True)
+class SlamResult:
+    """Trajectory, map, associations and how they came about."""
+
+    state: SlamState
+    """The final state."""
+    associations: Associations
+    """Marginal association of every detection."""
+    infos: tuple[StepInfo, ...]
+    """One record an iteration."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time by phase."""
+    history: tuple[Estimate, ...] = ()
+    """Poses and landmarks of every iteration: odometry first, the result last."""
+
+    @property
+    def T_world_camera(self) -> Float[np.ndarray, "n 4 4"]:
+        """Corrected camera poses, one row for each row of the odometry."""
+        return self.state.estimate.T_world_camera
+
+    @cached_property
+    def linearisation(self) -> Linearisation:
+        """The final graph linearised at the answer."""
+        return linearise(final_graph(self.state), self.state.estimate)
+
+    def pose_covariances(self, rows: Int[np.ndarray, " r"] | None = None) -> Float[np.ndarray, "r 6 6"]:
+        """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed."""
+        rows = np.arange(len(self.T_world_camera)) if rows is None else np.asarray(rows, dtype=np.int64)
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(self.T_world_camera)):
+            raise input_error("no such pose", got=[int(rows.min()), int(rows.max())],
+                              expected=f"0 to {len(self.T_world_camera) - 1}")
+        return self.linearisation.covariance(self.linearisation.landmarks + rows)
+
+    def landmark_covariances(self) -> Float[np.ndarray, "m 6 6"]:
+        """Covariances of all landmarks, [rotation rad, position m] in the object's own frame."""
+        return self.linearisation.covariance(np.arange(self.linearisation.landmarks))
+
+    @cached_property
+    def landmarks(self) -> tuple[Landmark, ...]:
+        """All landmarks with their answers."""
+        state = self.state
+        poses = state.estimate.T_world_landmark
+        covariance = self.landmark_covariances()
+        existence = self.existence()
+        classes = self.class_posterior()
+        total = np.bincount(self.associations.landmark, weights=self.associations.weight, minlength=len(poses))
+        sizes = self._sizes()
+        out = []
+        for j, T in enumerate(poses):
+            R = T[:3, :3]
+            known = state.features.latent.shape[1] > 0 and state.features.latent_variance[j, 0] < LARGE_VARIANCE
+            out.append(
+                Landmark(
+                    index=j,
+                    T_world_object=T,
+                    covariance=covariance[j],
+                    position_covariance=R @ covariance[j, 3:, 3:] @ R.T,
+                    oriented=bool(state.features.oriented[j]),
+                    existence=float(existence[j]),
+                    class_posterior={c: float(p) for c, p in zip(state.prior.categories, classes[j])}
+                    if len(classes[j])
+                    else {},
+                    latent=state.features.latent[j] if known else None,
+                    latent_variance=state.features.latent_variance[j] if known else None,
+                    size=sizes[j],
+                    detections=float(total[j]),
+                    first_frame=int(state.features.first[j]),
+                    last_frame=int(state.features.last[j]),
+                )
+            )
+        return tuple(out)
+
+    def decode_landmarks(self, model: LatentDecoder, samples: int = 8, seed: int = 0) -> dict[str, Voxels]:
+        """Mean and variance of the voxels of every landmark that has a latent (see `shapes.decode_landmarks`)."""
+        return decode_landmarks(self.landmarks, model, samples=samples, seed=seed)
+
+    def _sizes(self) -> list[np.ndarray | None]:
+        table, state = self.state.problem.observations, self.state
+        size = table.size[state.rows]
+        known = np.isfinite(size).all(axis=1)
+        total = np.bincount(state.landmark[known], weights=state.weight[known], minlength=len(state.static))
+        summed = np.zeros((len(state.static), 3))
+        np.add.at(summed, state.landmark[known], state.weight[known, None] * size[known])
+        return [summed[j] / total[j] if total[j] > 0 else None for j in range(len(total))]
+
+    def existence(self) -> Float[np.ndarray, " m"]:
+        """Probability that each landmark is an object rather than background seen again and again.
+
+        Log odds: `log lambda_new + sum_k w_k [log q(o_k) + log N(x_k; l)] + log |2 pi Sigma_l|^1/2` (the landmark's
+        position integrated out) less `sum_k w_k [log(1 - q(o_k)) + log lambda_clutter]`.
+        """
+        state = self.state
+        table, rows = state.problem.observations, state.rows
+        m = len(state.static)
+        frame = table.frame[rows]
+        predicted = transform(
+            inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
+        )
+        error = predicted - table.position[rows]
+        S = state.noise.position_covariance[rows]
+        objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
+        log_ratio = (np.log(objectness) - np.log1p(-objectness) - np.log(state.noise.clutter_rate)
+                     + log_normal(error, S))
+        log_odds = np.full(m, np.log(state.noise.new_rate))
+        np.add.at(log_odds, state.landmark, state.weight * log_ratio)
+        information = np.tile(1e-12 * np.eye(3), (m, 1, 1))
+        R = state.estimate.T_world_camera[frame, :3, :3]
+        np.add.at(
+            information, state.landmark, state.weight[:, None, None] * (R @ np.linalg.inv(S) @ np.swapaxes(R, 1, 2))
+        )
+        log_odds += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
+        return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700)))
+
+    def class_posterior(self) -> Float[np.ndarray, "m c"]:
+        """Posterior over categories of each landmark from all its detections; no columns where none was reported."""
+        state = self.state
+        count = len(state.prior.categories)
+        log_posterior = np.tile(state.prior.log_frequency, (len(state.static), 1)).reshape(len(state.static), count)
+        if not count:
+            return log_posterior
+        category = category_index(state.problem.observations, state.prior)[state.rows]
+        error = state.config.category_error
+        for j, c, w in zip(state.landmark, category, state.weight):
+            if c >= 0:
+                log_likelihood = np.full(count, np.log(error / max(count - 1, 1)))
+                log_likelihood[c] = np.log1p(-error)
+                log_posterior[j] += w * log_likelihood
+        log_posterior -= np.logaddexp.reduce(log_posterior, axis=1, keepdims=True)
+        return np.exp(log_posterior)

@@ -1,0 +1,66 @@
+"""State of the EM: what is fixed for a drive, and what an iteration changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.graph import Estimate, Links
+from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.tracking import Tracklets
+
+
+@dataclass(frozen=True)
+class SlamState:
+    """Everything an iteration reads and returns."""
+
+    problem: SlamProblem
+    """Odometry and observations."""
+    config: SlamConfig
+    """Settings."""
+    noise: NoiseModel
+    """Scales in use."""
+    prior: FeaturePrior
+    """Population of features."""
+    tracklets: Tracklets
+    """Short-term tracks, numbered with moving ones."""
+    static: Int[np.ndarray, " m"]
+    """Tracks that are landmarks of the graph."""
+    rows: Int[np.ndarray, " k"]
+    """Detections in the graph."""
+    landmark: Int[np.ndarray, " k"]
+    """Landmark (index into `static`) of each of them."""
+    weight: Float[np.ndarray, " k"]
+    """Their weights: probability of being that object rather than background."""
+    features: TrackletFeatures
+    """Features of the landmarks."""
+    estimate: Estimate
+    """Poses and landmarks."""
+    links: Links
+    """Weighted links in use."""
+    typical_range: float
+    """Median range of detections, m."""
+    iteration: int = 0
+    """Iterations done."""
+    closing: bool = True
+    """Whether constellation rounds still run."""
+    graph_error: float = 0.0
+    """Half the sum of squared whitened residuals of the last M-step."""
+    closed: dict[int, int] = field(default_factory=dict)
+    """Tracklets closed by constellation, newer to older."""
+
+    @property
+    def link_scale(self) -> float:
+        """How much one object's measured position varies between passes, m: half the typical detection scale."""
+        return link_scale(self.noise)
+
+
+def link_scale(noise: NoiseModel) -> float:
+    """Half the median scale of a detected position, m."""
+    if not len(noise.position_covariance):
+        return 0.1
+    return 0.5 * float(np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3))

@@ -1,0 +1,281 @@
+"""Short-term tracks: detections of one object in neighbouring frames, put together in the odometry frame.
+
+Each frame is one association problem with exact marginals: a detection belongs to a live track, founds a new one, or is
+background. Odometry drifts little over the life of a track, so tracks are reliable; they are what later is associated
+over loops, each with the evidence of all its detections.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from nolbo_ppl.geometry.pose import transform
+from nolbo_ppl.inference.association import association_marginals
+from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_features, fuse_latent
+from nolbo_ppl.inference.slam.gaussian import squared_distance
+from nolbo_ppl.inference.slam.orientation import (
+    UNIFORM_LOG_DENSITY,
+    RotationModes,
+    mixture_log_density,
+    observed_modes,
+    resolved_symmetry,
+)
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+
+GATE = 30.0
+"""Squared Mahalanobis distance beyond which a detection cannot belong to a track (3 degrees of freedom: p = 1e-6)."""
+
+
+@dataclass(frozen=True)
+class Tracklets:
+    """Short-term tracks and the detections they are made of."""
+
+    of_observation: Int[np.ndarray, " k"]
+    """Track of each detection, -1 for none."""
+    weight: Float[np.ndarray, " k"]
+    """Marginal probability of that assignment within its frame."""
+    first: Int[np.ndarray, " m"]
+    """Frame of the first detection."""
+    last: Int[np.ndarray, " m"]
+    """Frame of the last one."""
+    count: Int[np.ndarray, " m"]
+    """Number of detections."""
+    moving: Bool[np.ndarray, " m"]
+    """Tracks of objects that move."""
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+class Tracker:
+    """The live tracks, advanced frame by frame; what the batch front end and the online one share."""
+
+    def __init__(
+        self, config: SlamConfig, dimension: int, prior: FeaturePrior, new_rate: float, clutter_rate: float
+    ) -> None:
+        self.config, self.prior = config, prior
+        self.new_rate, self.clutter_rate = new_rate, clutter_rate
+        self.index = np.zeros(0, dtype=np.int64)
+        self.mean = np.zeros((0, 3))
+        self.covariance = np.zeros((0, 3, 3))
+        self.last = np.zeros(0, dtype=np.int64)
+        self.modes = RotationModes(np.zeros((0, 1)), np.zeros((0, 1, 3, 3)), np.zeros((0, 1)))
+        self.oriented = np.zeros(0, dtype=bool)
+        self.latent = np.zeros((0, dimension))
+        self.latent_variance = np.zeros((0, dimension))
+        self.category = np.zeros(0, dtype=np.int64)
+        self.total = 0
+
+    def predict(
+        self, T_world_camera: Float[np.ndarray, "4 4"], frame: int, rotation_step: float, translation_step: float
+    ) -> None:
+        """Drop tracks not seen for long; widen the others by the drift of one step at their distance."""
+        live = frame - self.last <= self.config.track_gap
+        if not live.all():
+            self._keep(live)
+        distance = self.mean - T_world_camera[:3, 3]
+        variance = translation_step**2 + rotation_step**2 * np.sum(distance**2, axis=1)
+        self.covariance += variance[:, None, None] * np.eye(3)
+
+    def _keep(self, rows: np.ndarray) -> None:
+        for name in ("index", "mean", "covariance", "last", "oriented", "latent", "latent_variance", "category"):
+            setattr(self, name, getattr(self, name)[rows])
+        self.modes = self.modes.select(rows)
+
+    def associate(
+        self,
+        position: Float[np.ndarray, "n 3"],
+        covariance: Float[np.ndarray, "n 3 3"],
+        modes: RotationModes,
+        oriented: Bool[np.ndarray, " n"],
+        symmetry: Int[np.ndarray, " n"],
+        latent: Float[np.ndarray, "n d"],
+        latent_variance: Float[np.ndarray, "n d"],
+        category: Int[np.ndarray, " n"],
+        objectness: Float[np.ndarray, " n"],
+        frame: int,
+    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1: background."""
+        count = max(modes.log_weight.shape[1], self.modes.log_weight.shape[1])
+        modes, self.modes = modes.padded(count), self.modes.padded(count)
+        n, m = len(position), len(self.index)
+        log_likelihood = np.full((n, m), -np.inf)
+        log_object, log_background = np.log(objectness), np.log1p(-objectness) + np.log(self.clutter_rate)
+        log_null = np.logaddexp(log_object + np.log(self.new_rate), log_background)
+        if m:
+            gap = position[:, None] - self.mean[None]
+            S = covariance[:, None] + self.covariance[None]
+            near = np.sum(gap**2, axis=2) <= GATE * np.trace(S, axis1=2, axis2=3)
+            k, j = np.nonzero(near)
+            S, gap = S[k, j], gap[k, j]
+            square, log_det = squared_distance(gap, S)
+            inside = square < GATE
+            k, j = k[inside], j[inside]
+            value = log_object[k] - 0.5 * (square + log_det)[inside]
+            both = np.flatnonzero(oriented[k] & self.oriented[j])
+            if len(both):
+                value[both] += self._orientation(j[both], modes.select(k[both]), symmetry[k[both]])
+            value += self.prior.pair_log_ratio(latent[k], latent_variance[k], category[k], self.latent[j],
+                                               self.latent_variance[j], self.category[j])
+            log_likelihood[k, j] = value
+        if np.isfinite(log_likelihood).any():
+            marginals = association_marginals(log_likelihood, log_null, associator=self.config.associator)
+            weights, null = np.asarray(marginals.weights), np.asarray(marginals.null)
+        else:
+            weights, null = np.zeros((n, m)), np.ones(n)
+        assigned, weight = np.full(n, -1, dtype=np.int64), null.copy()
+        best = np.argmax(weights, axis=1) if m else np.zeros(n, dtype=np.int64)
+        found = []
+        for i in range(n):
+            if m and weights[i, best[i]] > 0.5:
+                track = int(best[i])
+                self._update(track, position[i], covariance[i], latent[i], latent_variance[i], frame)
+                if oriented[i]:
+                    self._orient(track, modes.select(np.array([i])), symmetry[[i]])
+                assigned[i], weight[i] = self.index[track], weights[i, track]
+            elif null[i] > 0.5 and objectness[i] > 0.05:
+                found.append(i)
+        if found:
+            rows = np.array(found, dtype=np.int64)
+            new = np.arange(self.total, self.total + len(rows))
+            self.total += len(rows)
+            assigned[rows] = new
+            self.index = np.concatenate([self.index, new])
+            self.mean = np.concatenate([self.mean, position[rows]])
+            self.covariance = np.concatenate([self.covariance, covariance[rows]])
+            self.last = np.concatenate([self.last, np.full(len(rows), frame)])
+            self.oriented = np.concatenate([self.oriented, oriented[rows]])
+            self.modes = RotationModes(*(np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]])
+                                         for name in ("log_weight", "R", "scale")))
+            self.latent = np.concatenate([self.latent, latent[rows]])
+            self.latent_variance = np.concatenate([self.latent_variance, latent_variance[rows]])
+            self.category = np.concatenate([self.category, category[rows]])
+        return assigned, weight
+
+    def _update(
+        self, j: int, position: np.ndarray, covariance: np.ndarray, latent: np.ndarray, latent_variance: np.ndarray, frame: int
+    ) -> None:
+        gain = np.linalg.solve(self.covariance[j] + covariance, self.covariance[j]).T
+        self.mean[j] += gain @ (position - self.mean[j])
+        self.covariance[j] = self.covariance[j] - gain @ self.covariance[j]
+        self.covariance[j] = 0.5 * (self.covariance[j] + self.covariance[j].T)
+        self.latent[j], self.latent_variance[j] = fuse_latent(
+            self.latent[j], self.latent_variance[j], latent, latent_variance
+        )
+        self.last[j] = frame
+
+    def _by_mode(self, tracks: np.ndarray, modes: RotationModes, symmetry: np.ndarray) -> np.ndarray:
+        """Log density [n, K] of observed orientations given each mode of a track's, both widths added."""
+        n, count = modes.log_weight.shape
+        own = self.modes.select(tracks)
+        seen = modes.select(np.repeat(np.arange(n), count))
+        wide = RotationModes(seen.log_weight, seen.R, np.hypot(seen.scale, own.scale.reshape(-1, 1)))
+        return mixture_log_density(own.R.reshape(-1, 3, 3), wide, np.repeat(symmetry, count), self.config).reshape(n, count)
+
+    def _orientation(self, tracks: np.ndarray, modes: RotationModes, symmetry: np.ndarray) -> np.ndarray:
+        """Log ratio of observed orientations given tracks to any orientation."""
+        joint = self.modes.log_weight[tracks] + self._by_mode(tracks, modes, symmetry)
+        return np.logaddexp.reduce(joint, axis=1) - UNIFORM_LOG_DENSITY
+
+    def _orient(self, j: int, modes: RotationModes, symmetry: np.ndarray) -> None:
+        """The first orientation founds the track's modes, later ones weigh them."""
+        if not self.oriented[j]:
+            self.oriented[j] = True
+            self.modes.log_weight[j], self.modes.R[j], self.modes.scale[j] = modes.log_weight[0], modes.R[0], modes.scale[0]
+        elif self.modes.log_weight.shape[1] > 1:
+            joint = self.modes.log_weight[j] + self._by_mode(np.array([j]), modes, symmetry)[0]
+            self.modes.log_weight[j] = joint - np.logaddexp.reduce(joint)
+
+
+def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior) -> Tracklets:
+    """Run the tracker over all frames and mark what moves."""
+    table = problem.observations
+    n = len(table)
+    assigned, weight = np.full(n, -1, dtype=np.int64), np.zeros(n)
+    if n:
+        R = problem.odometry[table.frame, :3, :3]
+        world = transform(problem.odometry[table.frame], table.position)
+        covariance = R @ noise.position_covariance @ np.swapaxes(R, 1, 2)
+        modes, oriented = observed_modes(table, noise.rotation_scale).turned(R), table.has_rotation
+        latent, latent_variance, category = detection_features(table, noise, prior)
+        symmetry = resolved_symmetry(table, config)
+        objectness = np.clip(table.objectness, *config.objectness_limits)
+        order = np.argsort(table.frame, kind="stable")
+        frames, starts = np.unique(table.frame[order], return_index=True)
+        groups = dict(zip(frames.tolist(), np.split(order, starts[1:])))
+        tracker = Tracker(config, table.latent_dim, prior, noise.new_rate, noise.clutter_rate)
+        for t in range(int(frames[0]), int(frames[-1]) + 1):
+            if t:
+                tracker.predict(problem.odometry[t], t, noise.rotation_step[t - 1], noise.translation_step[t - 1])
+            rows = groups.get(t)
+            if rows is None:
+                continue
+            assigned[rows], weight[rows] = tracker.associate(
+                world[rows], covariance[rows], modes.select(rows), oriented[rows], symmetry[rows], latent[rows],
+                latent_variance[rows], category[rows], objectness[rows], t)
+    return summarise_tracks(problem, noise, config, assigned, weight)
+
+
+def summarise_tracks(
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    assigned: Int[np.ndarray, " k"],
+    weight: Float[np.ndarray, " k"],
+) -> Tracklets:
+    """First and last frame, length, and a motion test of every track; short tracks are dissolved, numbers are repacked."""
+    table = problem.observations
+    total = int(assigned.max(initial=-1)) + 1
+    count = np.bincount(assigned[assigned >= 0], minlength=total)
+    keep = count >= config.track_minimum
+    number = np.where(keep, np.cumsum(keep) - 1, -1)
+    assigned = np.where(assigned >= 0, number[np.maximum(assigned, 0)] if total else -1, -1)
+    m = int(keep.sum())
+    first, last = np.full(m, len(problem)), np.full(m, -1)
+    used = assigned >= 0
+    np.minimum.at(first, assigned[used], table.frame[used])
+    np.maximum.at(last, assigned[used], table.frame[used])
+    moving = moving_tracks(problem, noise, config, assigned, m)
+    return Tracklets(
+        assigned, np.where(used, weight, 0.0), first, last, count[keep] if total else np.zeros(0, int), moving
+    )
+
+
+def moving_tracks(
+    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, assigned: Int[np.ndarray, " k"], tracks: int
+) -> Bool[np.ndarray, " m"]:
+    """Tracks whose positions are explained much better by a constant velocity than by rest.
+
+    The evidence is the fall of the weighted sum of squares when each coordinate is given a slope in time, less half a
+    log of the sample size for each of the three slopes (BIC). Residuals are in the odometry frame; its drift over the
+    track is part of the variance.
+    """
+    table = problem.observations
+    rows = np.flatnonzero(assigned >= 0)
+    if not len(rows) or not len(noise.rotation_step):
+        return np.zeros(tracks, dtype=bool)
+    world = transform(problem.odometry[table.frame[rows]], table.position[rows])
+    a, t = assigned[rows], table.frame[rows].astype(np.float64)
+    distance = np.linalg.norm(table.position[rows], axis=1)
+    variance = np.trace(noise.position_covariance[rows], axis1=1, axis2=2) / 3
+
+    def per_track(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(a, weights=v, minlength=tracks) for v in np.atleast_2d(values.T)], axis=-1)
+
+    w = 1.0 / variance
+    total = per_track(w)
+    centre = per_track(w[:, None] * np.column_stack([t, world])) / np.maximum(total, 1e-300)
+    dt, dx = t - centre[a, 0], world - centre[a, 1:]
+    spread = per_track(w * dt**2)
+    slope = per_track(w[:, None] * dt[:, None] * dx) / np.maximum(spread, 1e-300)
+    # Drift of the odometry over the track passes for motion of the object: its slope variance is added.
+    step = float(np.median(noise.translation_step)) ** 2 + (float(np.median(noise.rotation_step)) * distance) ** 2
+    drift = per_track(step) / np.maximum(per_track(np.ones(len(a))), 1)
+    duration = np.maximum(per_track(dt**2) / np.maximum(per_track(np.ones(len(a))), 1), 1e-12)
+    slope_variance = 1.0 / np.maximum(spread, 1e-300) + drift / np.sqrt(12 * duration)
+    gain = 0.5 * np.sum(slope**2, axis=1) / slope_variance[:, 0]
+    n = np.bincount(a, minlength=tracks)
+    return (n >= 3) & (gain - 1.5 * np.log(np.maximum(n, 1)) > config.motion_log_odds)

@@ -1,0 +1,187 @@
+"""One line of `scenes.jsonl`: the labels of one image, read with every check.
+
+A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objects": [...]}`; an object is
+`{"box": [x0, y0, x1, y1] px, "category", "instance", "rotation": [qx, qy, qz, qw] of R_camera_object, "position":
+[x, y, z] m of the box centre in the camera frame, "size": m (box diagonal), "dimensions": [3] m, "visibility",
+"symmetry"}`. Only `image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from nolbo_ppl.categories import CATEGORY_SYMMETRY
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.rotation import quaternion_to_matrix
+
+UNIT_TOLERANCE = 1e-3
+"""How far a quaternion's length may lie from 1."""
+BORDER_TOLERANCE = 1.0
+"""How far a box may stick out of its image, px; it is cut to the image."""
+
+
+@dataclass(frozen=True)
+class ObjectRecord:
+    """One labelled object; None where a label is missing."""
+
+    box: Float[np.ndarray, " 4"]
+    category: str | None
+    instance: str | None
+    R_camera_object: Float[np.ndarray, "3 3"] | None
+    position: Float[np.ndarray, " 3"] | None
+    size: float | None
+    visibility: float
+    symmetry: int
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """One labelled image."""
+
+    image: Path
+    intrinsics: Float[np.ndarray, " 4"]
+    objects: tuple[ObjectRecord, ...]
+    ignore: Float[np.ndarray, "k 4"]
+    """Boxes of parts of the image whose objects are not labelled: what is found there is not judged."""
+
+
+def _is_number(value: object) -> bool:
+    """A finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class _Line:
+    """Where a value came from, for the errors."""
+
+    def __init__(self, file: Path, line: int) -> None:
+        self.file, self.line = file, line
+
+    def error(self, what: str, got: object, expected: str, do: str | None = None) -> Exception:
+        return input_error(what, got=got, expected=expected, do=do, file=self.file, line=self.line)
+
+    def numbers(self, row: dict[str, Any], field: str, where: str, n: int, expected: str) -> np.ndarray:
+        """A list of n finite numbers."""
+        value = row.get(field)
+        if not isinstance(value, list) or len(value) != n or not all(_is_number(v) for v in value):
+            raise self.error(f"{where}{field}", value, expected)
+        return np.array(value, dtype=np.float64)
+
+    def number(self, row: dict[str, Any], field: str, where: str, expected: str) -> float:
+        """One finite number."""
+        value = row[field]
+        if not _is_number(value):
+            raise self.error(f"{where}{field}", value, expected)
+        return float(value)
+
+
+def _parse_box(at: _Line, row: dict[str, Any], where: str, width: int, height: int) -> np.ndarray:
+    """A box inside the image."""
+    box = at.numbers(row, "box", where, 4, "[x0, y0, x1, y1] in px")
+    if box[0] >= box[2] or box[1] >= box[3]:
+        raise at.error(f"{where}box", box.tolist(), "x0 < x1 and y0 < y1")
+    limit = np.array([width, height, width, height])
+    if (box < -BORDER_TOLERANCE).any() or (box > limit + BORDER_TOLERANCE).any():
+        raise at.error(f"{where}box", box.tolist(), f"inside the image of {width} x {height} px", "cut it to the image")
+    return np.clip(box, 0, limit)
+
+
+def _parse_rotation(at: _Line, row: dict[str, Any], where: str) -> np.ndarray:
+    quaternion = at.numbers(row, "rotation", where, 4, "[qx, qy, qz, qw] of R_camera_object")
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1) > UNIT_TOLERANCE:
+        raise at.error(f"{where}rotation", f"{quaternion.tolist()} of length {length:.6g}", "a unit quaternion")
+    return quaternion_to_matrix(torch.from_numpy(quaternion)).numpy()
+
+
+def _parse_object(
+    at: _Line, row: object, number: int, width: int, height: int, categories: Sequence[str], symmetries: Mapping[str, int]
+) -> ObjectRecord:
+    where = f"objects[{number}]."
+    if not isinstance(row, dict):
+        raise at.error(f"objects[{number}]", row, 'an object such as {"box": [x0, y0, x1, y1]}')
+    box = _parse_box(at, row, where, width, height)
+    known = {field for field, value in row.items() if value is not None}
+    category = row["category"] if "category" in known else None
+    if category is not None and category not in categories:
+        raise at.error(f"{where}category", repr(category), "one of " + ", ".join(categories))
+    instance = row["instance"] if "instance" in known else None
+    if instance is not None and not isinstance(instance, str):
+        raise at.error(f"{where}instance", repr(instance), "a name (string)")
+    R = _parse_rotation(at, row, where) if "rotation" in known else None
+    position = size = None
+    if "position" in known:
+        position = at.numbers(row, "position", where, 3, "[x, y, z] in m")
+        if position[2] <= 0:
+            raise at.error(f"{where}position", position.tolist(), "a point before the camera (z > 0)")
+    if "size" in known:
+        size = at.number(row, "size", where, "the box diagonal in m, positive")
+        if size <= 0:
+            raise at.error(f"{where}size", size, "the box diagonal in m, positive")
+    elif "dimensions" in known:
+        dimensions = at.numbers(row, "dimensions", where, 3, "three side lengths in m, positive")
+        if (dimensions <= 0).any():
+            raise at.error(f"{where}dimensions", dimensions.tolist(), "three side lengths in m, positive")
+        size = float(np.linalg.norm(dimensions))
+    visibility = at.number(row, "visibility", where, "a share from 0 to 1") if "visibility" in known else 1.0
+    if not 0 <= visibility <= 1:
+        raise at.error(f"{where}visibility", visibility, "a share from 0 to 1")
+    symmetry = row["symmetry"] if "symmetry" in known else symmetries.get(category or "", 1)
+    if isinstance(symmetry, bool) or not isinstance(symmetry, int) or symmetry < 0:
+        raise at.error(f"{where}symmetry", symmetry, "0 (free about the vertical axis), 1 (none) or n (n-fold)")
+    return ObjectRecord(box, category, instance, R, position, size, visibility, symmetry)
+
+
+def parse_record(
+    row: dict[str, Any], file: Path, line: int, categories: Sequence[str], image_size: tuple[int, int], image: Path,
+    symmetries: Mapping[str, int] = CATEGORY_SYMMETRY,
+) -> SceneRecord:
+    """Check one line and turn it into a record.
+
+    Args:
+        row: the parsed JSON.
+        file: the file it came from.
+        line: its line, from 1.
+        categories: known category names.
+        image_size: width and height of the image, px.
+        image: path of the image.
+        symmetries: symmetry of an object that states none, by category; 1 for names that are missing.
+
+    Raises:
+        InputError: names file, line and field, what was got and what was expected.
+    """
+    at = _Line(file, line)
+    expected = "[fx, fy, cx, cy] in px, all positive"
+    intrinsics = at.numbers(row, "intrinsics", "", 4, expected)
+    if (intrinsics <= 0).any():
+        raise at.error("intrinsics", intrinsics.tolist(), expected)
+    objects = row.get("objects")
+    if not isinstance(objects, list):
+        raise at.error("objects", objects, "a list of objects (empty when there is none)")
+    parsed = [_parse_object(at, thing, k, *image_size, categories, symmetries) for k, thing in enumerate(objects)]
+    regions = [] if row.get("ignore") is None else row["ignore"]
+    if not isinstance(regions, list):
+        raise at.error("ignore", regions, "a list of boxes [x0, y0, x1, y1] in px")
+    ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
+    return SceneRecord(image, intrinsics, tuple(parsed), np.array(ignore, dtype=np.float64).reshape(-1, 4))
+
+
+def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Path:
+    """Path of a line's image, which must exist."""
+    name = row.get("image")
+    if not isinstance(name, str) or not name:
+        raise input_error("image", got=name, expected="a path relative to the folder", file=file, line=line)
+    path = folder / name
+    if not path.is_file():
+        raise input_error(
+            "image", got=name, expected=f"an image file in {folder}", do="is the data set complete?",
+            file=file, line=line,
+        )  # fmt: skip
+    return path

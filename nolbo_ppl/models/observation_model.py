@@ -1,0 +1,39 @@
+"""The whole observation model: story, guide and shape guide under one roof, with one state dictionary."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from nolbo_ppl.models.generative import Story
+from nolbo_ppl.models.guide import Guide
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.shape_vae import ShapeGuide, ShapeStory
+
+
+class Nolbo(nn.Module):
+    """Story (prior networks, decoder), image guide (encoder, head) and shape guide (3D encoder)."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.story = Story(config)
+        self.guide = Guide(config, self.story.prior)
+        self.shape_guide = ShapeGuide(config)
+
+    def set_half_precision(self, enabled: bool) -> None:
+        """Run the networks' convolutions and dense layers in bfloat16 (weights, latents and the bound stay as they are)."""
+        for part in (self.guide, self.story.decoder, self.shape_guide.encoder):
+            part.half_precision = enabled
+
+    @property
+    def shape_story(self) -> ShapeStory:
+        """The story of shapes alone, sharing prior and decoder."""
+        return ShapeStory(self.story)
+
+    @classmethod
+    def from_seed(cls, config: ModelConfig, seed: int) -> Nolbo:
+        """Freshly initialised networks that depend on the seed only; torch's global generator is left as it was."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return cls(config)

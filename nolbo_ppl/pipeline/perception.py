@@ -1,0 +1,129 @@
+"""The guide on every keyframe: the lines of `observations.jsonl`, positions refined where depth is at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from tqdm import tqdm
+
+from nolbo_ppl.data.sequences import FrameSequence
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.pipeline.depth_refinement import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
+from nolbo_ppl.structures.object_posteriors import Observations
+
+STRUCTURED_LIGHT = 0.0015
+"""Growth of the error of a structured light camera's depth with its square, 1/m (Khoshelham and Elberink 2012)."""
+Picture = UInt8[np.ndarray, "h w 3"]
+Observe = Callable[[Sequence[Picture], Float[np.ndarray, " 4"]], Sequence[Observations]]
+"""Images of one camera and its intrinsics to what is observed in each."""
+
+
+class DepthSource(Protocol):
+    """Depth of a keyframe."""
+
+    scale: DepthScale
+    """Its errors."""
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe's image along the optical axis, m, NaN unknown; None when there is none."""
+
+
+class DepthPictures:
+    """Depth from a folder of 16 bit pictures.
+
+    Args:
+        paths: one a keyframe, None where there is none.
+        scale: what their numbers mean.
+    """
+
+    def __init__(self, paths: Sequence[Path | None], scale: DepthScale) -> None:
+        self.paths, self.scale = tuple(paths), scale
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe."""
+        path = self.paths[k]
+        return None if path is None else read_depth(path, self.scale)
+
+
+class StereoPairs:
+    """Depth by matching the right image of each keyframe.
+
+    Args:
+        right: reads the right image of a keyframe.
+        focal: focal length, px.
+        baseline: distance of the cameras, m.
+    """
+
+    def __init__(self, right: Callable[[int], Picture], focal: float, baseline: float) -> None:
+        self.right, self.focal, self.baseline = right, focal, baseline
+        self.scale = stereo_scale(focal, baseline)
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe."""
+        return stereo_depth(image, self.right(k), self.focal, self.baseline)
+
+
+class SequenceDepth:
+    """Depth the sequence itself brings (a TUM RGB-D folder), where it does.
+
+    Args:
+        frames: the images.
+        index: image of every keyframe.
+    """
+
+    def __init__(self, frames: FrameSequence, index: Sequence[int]) -> None:
+        self.frames, self.index, self.scale = frames, tuple(index), DepthScale(ratio=STRUCTURED_LIGHT)
+
+    def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
+        """Depth of a keyframe."""
+        known = self.frames.depth(self.index[k])
+        return None if known is None else np.where(known > 0, known, np.nan)
+
+
+def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Path | None]:
+    """The file of a folder that belongs to each image: of the same stem, or, where no stem fits, of the same number.
+
+    Raises:
+        InputError: no such folder, or neither stems nor numbers fit.
+    """
+    if not folder.is_dir():
+        raise input_error("no such folder", file=folder)
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif", ".tiff"))
+    by_stem = {path.stem: path for path in files}
+    found = [by_stem.get(Path(image).stem) for image in images]
+    if any(found):
+        return found
+    if len(files) <= max(index, default=-1):
+        raise input_error("pictures that belong to no image", got=f"{len(files)} files",
+                          expected="the images' names, or one each", file=folder)  # fmt: skip
+    return [files[i] for i in index]
+
+
+def observed_rows(
+    observe: Observe, read: Callable[[int], Picture], names: Sequence[str], intrinsics: Float[np.ndarray, " 4"],
+    depth: DepthSource, batch: int,
+) -> Iterator[dict[str, Any]]:
+    """Lines of `observations.jsonl`, batch by batch, with a progress bar on a terminal.
+
+    Args:
+        observe: observations of each of some images of one camera.
+        read: image of a keyframe.
+        names: what each keyframe's image is called.
+        intrinsics: [fx, fy, cx, cy], px.
+        depth: refines positions where it is known.
+        batch: images in memory at once.
+    """
+    with tqdm(total=len(names), desc="observing", unit="image", disable=None) as bar:
+        for first in range(0, len(names), batch):
+            frames = range(first, min(first + batch, len(names)))
+            images = [read(k) for k in frames]
+            for k, image, observed in zip(frames, images, observe(images, intrinsics)):
+                known = depth.depth(k, image)
+                if known is not None:
+                    observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
+                yield from observed.rows(k, names[k])
+            bar.update(len(frames))

@@ -1,0 +1,166 @@
+"""What a run is made from: images, camera, odometry and truth of every image; which images are keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from nolbo_ppl.data.sequences import CameraIntrinsics, FrameSequence, ImageFolder, open_frames, read_camera, read_lengths
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.trajectories import covariance_beside, poses_of_frames
+from nolbo_ppl.odometry import (
+    GroundHeight,
+    KnownLengths,
+    Odometry,
+    Scale,
+    at_keyframes,
+    estimate_odometry,
+    keyframes,
+    lengths_of,
+)
+from nolbo_ppl.pipeline.run_config import RunConfig
+
+Poses = Float[np.ndarray, "n 4 4"]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The input of a run."""
+
+    frames: FrameSequence
+    """All images."""
+    camera: CameraIntrinsics
+    """The camera that took them."""
+    used: Int[np.ndarray, " u"]
+    """Images that are looked at: every so many-th."""
+    truth: Poses | None
+    """True pose of every image."""
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, " 4"]:
+        """[fx, fy, cx, cy], px."""
+        return self.camera.vector
+
+    def file(self, k: int) -> Path:
+        """The file of an image; of a video, its name inside the video."""
+        if isinstance(self.frames, ImageFolder):
+            return self.frames.files[k]
+        return self.frames.path / self.frames.name(k)
+
+    def fingerprint(self) -> Any:
+        """What tells one sequence of images from another: names and sizes of its files."""
+        if isinstance(self.frames, ImageFolder):
+            return [[file.name, file.stat().st_size] for file in self.frames.files]
+        return [len(self.frames), self.frames.path.stat().st_size]
+
+
+@dataclass(frozen=True)
+class Every:
+    """Some frames of a sequence."""
+
+    frames: FrameSequence
+    """All."""
+    used: Int[np.ndarray, " u"]
+    """Which."""
+
+    def __len__(self) -> int:
+        return len(self.used)
+
+    def frame(self, k: int, /) -> UInt8[np.ndarray, "h w 3"]:
+        """One of them."""
+        return self.frames.frame(int(self.used[k]))
+
+
+@dataclass(frozen=True)
+class FoundOdometry:
+    """Odometry of the images that are looked at."""
+
+    odometry: Odometry
+    """Poses and, where they are known, covariances."""
+    stated: bool
+    """Whether covariances are known."""
+
+    def at(self, rows: Int[np.ndarray, " k"]) -> tuple[Poses, Float[np.ndarray, "k-1 6 6"] | None]:
+        """Poses at these rows and the covariances of the motions between them."""
+        chosen = at_keyframes(self.odometry, rows)
+        return chosen.T_world_camera, chosen.covariance if self.stated else None
+
+
+def open_drive(config: RunConfig) -> Drive:
+    """Open images, camera and truth.
+
+    Raises:
+        InputError: one of them is missing or malformed, or they do not fit each other.
+    """
+    frames = open_frames(config.images)
+    camera = read_camera(config.intrinsics, frames.size)
+    truth = None if config.truth is None else poses_of_frames(config.truth, len(frames), frames.times, of="the images")
+    return Drive(frames, camera, np.arange(0, len(frames), config.every), truth)
+
+
+def scale_of(drive: Drive, config: RunConfig) -> Scale:
+    """Where visual odometry has its lengths from: a wheel, the height over the ground, or the truth.
+
+    Raises:
+        InputError: nowhere, or a wheel file that does not fit.
+    """
+    if config.camera_height is not None:
+        return GroundHeight(config.camera_height, pitch=config.camera_pitch)
+    if config.wheel is not None:
+        return KnownLengths(lengths_between(wheel_lengths(config.wheel, len(drive.frames) - 1), drive.used))
+    if drive.truth is not None:
+        return KnownLengths(lengths_of(drive.truth[drive.used]))
+    raise input_error("visual odometry without a scale", expected="--camera-height, --wheel or --truth",
+                      do="or give an odometry of your own with --odometry")  # fmt: skip
+
+
+def wheel_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
+    """Lengths of the steps between successive images, m. Raises `InputError` when there are more or fewer of them."""
+    lengths = read_lengths(path)
+    if len(lengths) != count:
+        raise input_error("lengths of steps", got=f"{len(lengths)} numbers", expected=f"{count}, one between images", file=path)
+    return lengths
+
+
+def lengths_between(lengths: Float[np.ndarray, " n"], used: Int[np.ndarray, " u"]) -> Float[np.ndarray, " u-1"]:
+    """Way between the images that are looked at."""
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    return np.diff(along[used])
+
+
+def estimate_or_read(drive: Drive, config: RunConfig) -> FoundOdometry:
+    """The given odometry, with the covariances beside it where there are any, or visual odometry.
+
+    Raises:
+        InputError: an odometry that does not match the images, or none and no scale to make one.
+    """
+    if config.odometry is None:
+        found = estimate_odometry(
+            Every(drive.frames, drive.used), drive.intrinsics, scale_of(drive, config), config.visual, progress=True
+        )
+        return FoundOdometry(found, stated=True)
+    frames = drive.frames
+    poses = poses_of_frames(config.odometry, len(frames), frames.times, what="odometry", of="the images")
+    covariance = covariance_beside(config.odometry)
+    stated = covariance is not None and len(covariance) == len(poses) - 1
+    n = len(poses) - 1
+    every = Odometry(
+        T_world_camera=poses,
+        covariance=covariance if covariance is not None and stated else np.zeros((n, 6, 6)),
+        matches=np.zeros(n, dtype=np.int64),
+        inliers=np.zeros(n, dtype=np.int64),
+        flags=np.zeros(n, dtype=np.uint8),
+    )
+    return FoundOdometry(at_keyframes(every, drive.used), stated)
+
+
+def keyframe_rows(found: FoundOdometry, config: RunConfig) -> Int[np.ndarray, " k"]:
+    """Rows of the odometry that are keyframes: all, or those far enough from the last."""
+    if config.keyframe_distance == 0 and config.keyframe_angle == 0:
+        return np.arange(len(found.odometry))
+    distance, angle = (value or np.inf for value in (config.keyframe_distance, config.keyframe_angle))
+    return keyframes(found.odometry, distance, angle)

@@ -1,0 +1,1 @@
+"""Generated data: shapes, renderer, scenes, worlds and the data sets written from them."""

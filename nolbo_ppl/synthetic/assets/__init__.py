@@ -1,0 +1,1 @@
+"""Where scenes draw their shapes from: parametric families and CAD meshes."""

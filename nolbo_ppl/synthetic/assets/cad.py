@@ -1,0 +1,220 @@
+"""Shapes from folders of CAD meshes: users' own OFF, OBJ, PLY, GLB files, or an archive with ready voxels."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from tqdm import tqdm
+
+from nolbo_ppl.errors import NolboError, input_error
+from nolbo_ppl.geometry.voxels import voxels_to_mesh
+from nolbo_ppl.io.files import read_json
+from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
+from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
+from nolbo_ppl.synthetic.shapes.canonical_shape import Shape
+
+SUFFIXES = (".off", ".obj", ".ply", ".glb")
+ARCHIVE_FILES = ("meshes.npz", "meta.json", "voxels64.npz")
+ARCHIVE_VOXELS = 64
+BOX_TOLERANCE = 0.03
+"""How far (in diagonals; two voxels of 64^3) a simplified mesh may miss its box before its voxels replace it."""
+
+
+def load_cad_folder(
+    path: str | os.PathLike[str],
+    categories: Collection[str] | None = None,
+    *,
+    up: str = "+z",
+    front: str = "-y",
+    max_faces: int | None = 20_000,
+    diagonals: Mapping[str, float] | None = None,
+) -> list[Shape]:
+    """Load every CAD model of a folder as a `Shape` with one part, "body", sorted by file name.
+
+    Three layouts are understood:
+
+    - sub-folders named by category, each with OFF, OBJ, PLY or GLB files (at any depth): `car/beetle.obj`;
+    - files named `CATEGORY_NAME.EXT` in the folder itself: `car_beetle.obj`;
+    - an archive of `meshes.npz` (`NAME_v` vertices, `NAME_f` faces), `meta.json` (NAME: `category`, `bbox_min`,
+      `bbox_max`) and `voxels64.npz` (`names`, `solid`: packed bits of 64^3), all in the canonical frame already. Where
+      a mesh misses its box by more than 0.03 (a simplification that lost parts), marching cubes of its voxels
+      replace it.
+
+    Meshes are turned to the canonical frame (front to -y, z up), centred, and scaled to unit diagonal. Voxels are the
+    surface and all it shuts in, so that open meshes work. Files carry no unit: the metric diagonal comes from
+    `diagonals`, else from `TYPICAL_DIAGONAL`. The symmetry of the categories declared symmetric is measured on the
+    voxels (0, 4, 2 or 1); a category outside the twelve keeps its own name and is 0 (a solid of revolution) or 1.
+
+    Args:
+        path: the folder.
+        categories: only these; all by default.
+        up: the axis of the files that points up, e.g. "+y" for GLB by its standard.
+        front: the axis of the files that the front faces, e.g. "+z" for GLB.
+        max_faces: meshes with more faces are simplified by clustering their vertices; None never.
+        diagonals: metric box diagonals by category, overriding the table.
+
+    Raises:
+        InputError: no such folder, no model in it, or a model that is unreadable, empty or degenerate (names it).
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise input_error("no such folder of CAD models", file=folder)
+    turn = axis_rotation(up, front)
+    if max_faces is not None and max_faces < 4:
+        raise input_error("max_faces", got=max_faces, expected="at least 4, or None")
+    wanted = None if categories is None else set(categories)
+    if all((folder / name).is_file() for name in ARCHIVE_FILES):
+        shapes = list(_load_archive(folder, wanted, diagonals))
+    else:
+        files = [entry for entry in _list_files(folder) if wanted is None or entry[0] in wanted]
+        shapes = []
+        for category, instance, file in tqdm(files, desc="CAD", unit="mesh", disable=None):
+            vertices, faces = _read_mesh(file)
+            vertices = vertices @ turn.T
+            shapes.append(mesh_to_shape(category, instance, vertices, faces, max_faces, diagonals, file=file))
+    if not shapes:
+        which = "any category" if wanted is None else ", ".join(sorted(wanted))
+        raise input_error(
+            "no CAD model found",
+            expected=f"models of {which} as {', '.join(SUFFIXES)}",
+            do="name them CATEGORY/NAME.EXT or CATEGORY_NAME.EXT",
+            file=folder,
+        )
+    return shapes
+
+
+def axis_rotation(up: str, front: str) -> Float[np.ndarray, "3 3"]:
+    """Rotation from a frame with the given up and front axes to the canonical one (z up, front to -y).
+
+    Raises:
+        InputError: a name that is no signed axis, or both on one axis.
+    """
+    axes = {sign + name: (1.0 if sign == "+" else -1.0) * np.eye(3)[i] for sign in "+-" for i, name in enumerate("xyz")}
+    for name, value in (("up", up), ("front", front)):
+        if value not in axes:
+            raise input_error(f"{name} axis", got=repr(value), expected="one of " + ", ".join(axes))
+    z, y = axes[up], -axes[front]
+    if abs(z @ y) > 0.5:
+        raise input_error("up and front axes", got=f"{up} and {front}", expected="two different axes")
+    return np.stack([np.cross(y, z), y, z])
+
+
+def _list_files(folder: Path) -> list[tuple[str, str, Path]]:
+    """List (category, instance, file) of the two layouts of loose files, sorted; instance names are unique."""
+    found: dict[str, tuple[str, str, Path]] = {}
+    for file in sorted(folder.rglob("*")):
+        if file.suffix.lower() not in SUFFIXES or not file.is_file():
+            continue
+        parts = file.relative_to(folder).with_suffix("").parts
+        if len(parts) == 1:
+            category, name = _split_name(parts[0], file)
+        else:
+            category, name = parts[0], "-".join(parts[1:])
+        instance = f"{category}-{name}"
+        if instance in found:
+            raise input_error(
+                "two CAD models of one name",
+                got=f"{file.name} and {found[instance][2].name}",
+                do="rename one",
+                file=file,
+            )
+        found[instance] = (category, instance, file)
+    return list(found.values())
+
+
+def _split_name(stem: str, file: Path) -> tuple[str, str]:
+    """Split CATEGORY_NAME: at the end of a known category when it starts with one, else at the first underscore."""
+    known = [c for c in TYPICAL_DIAGONAL if stem.startswith(c + "_")]
+    category = max(known, key=len) if known else stem.partition("_")[0]
+    name = stem[len(category) + 1 :]
+    if not category or not name:
+        raise input_error(
+            "CAD file whose category is not told",
+            got=file.name,
+            expected="CATEGORY_NAME.EXT, or CATEGORY/NAME.EXT",
+            file=file,
+        )
+    return category, name
+
+
+def _read_mesh(file: Path) -> tuple[Vertices, Faces]:
+    """Read one mesh; the parts of a scene are joined in their places. Raises `InputError` naming the file."""
+    import trimesh  # delayed: heavy to import
+
+    try:
+        loaded: Any = trimesh.load_scene(file, process=False)
+        mesh: Any = loaded.to_mesh() if len(loaded.geometry) else None
+        vertices = np.zeros((0, 3)) if mesh is None else np.asarray(mesh.vertices, dtype=np.float64)
+        faces = np.zeros((0, 3), np.int64) if mesh is None else np.asarray(mesh.faces, dtype=np.int64)
+    except NolboError:
+        raise
+    except Exception as error:  # the readers of eight formats raise whatever they meet
+        raise input_error("unreadable CAD file", got=f"{type(error).__name__}: {error}", file=file) from error
+    return vertices, faces
+
+
+def _load_archive(folder: Path, wanted: set[str] | None, diagonals: Mapping[str, float] | None) -> Iterator[Shape]:
+    """Yield the shapes of an archive with ready voxels (see `load_cad_folder`)."""
+    meta = read_json(folder / "meta.json")
+    mesh_file, voxel_file = folder / "meshes.npz", folder / "voxels64.npz"
+    try:
+        # Opened here, since numpy leaves a file that is no archive open.
+        with (
+            mesh_file.open("rb") as mesh_bytes,
+            voxel_file.open("rb") as voxel_bytes,
+            np.load(mesh_bytes, allow_pickle=False) as meshes,
+            np.load(voxel_bytes, allow_pickle=False) as grids,
+        ):
+            row = {str(name): i for i, name in enumerate(grids["names"])}
+            solids = grids["solid"]
+            for name, info in meta.items():
+                if wanted is None or info["category"] in wanted:
+                    yield _archive_shape(name, info, meshes, solids[row[name]], diagonals, mesh_file)
+    except NolboError:
+        raise
+    except (
+        KeyError,
+        IndexError,
+        zipfile.BadZipFile,
+        OSError,
+        EOFError,
+        TypeError,
+        AttributeError,
+        ValueError,
+    ) as error:
+        raise input_error(
+            "malformed CAD archive",
+            got=f"{type(error).__name__}: {error}",
+            do="see load_cad_folder for its layout",
+            file=folder,
+        ) from error
+
+
+def _archive_shape(
+    name: str,
+    info: Mapping[str, Any],
+    meshes: Mapping[str, np.ndarray],
+    packed: np.ndarray,
+    diagonals: Mapping[str, float] | None,
+    file: Path,
+) -> Shape:
+    """Make one shape of an archive; its voxels follow the surface where that is moved by half a voxel or more."""
+    vertices = meshes[f"{name}_v"].astype(np.float64)
+    faces = meshes[f"{name}_f"].astype(np.int64)
+    solid = GridSolid(packed, ARCHIVE_VOXELS)
+    box = np.array([info["bbox_min"], info["bbox_max"]])
+    missed = np.inf if len(vertices) == 0 else np.abs(np.stack([vertices.min(0), vertices.max(0)]) - box).max()
+    if missed > BOX_TOLERANCE:
+        vertices, faces = voxels_to_mesh(solid.fill(ARCHIVE_VOXELS))
+    if len(vertices):
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        centre, scale = 0.5 * (low + high), float(np.linalg.norm(high - low))
+        if max(np.abs(centre).max(), abs(scale - 1.0)) > 0.5 / ARCHIVE_VOXELS:
+            solid = GridSolid(packed, ARCHIVE_VOXELS, (float(centre[0]), float(centre[1]), float(centre[2])), scale)
+    return mesh_to_shape(info["category"], name, vertices, faces, None, diagonals, solid=solid, file=f"{file}[{name}]")

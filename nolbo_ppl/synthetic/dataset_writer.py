@@ -1,0 +1,113 @@
+"""Data sets on disk: `images/*.png`, `scenes.jsonl`, `voxels.npz`, written in parallel, resumed, never half-written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.parallel import parallel
+from nolbo_ppl.synthetic.scenes.scene_records import record_of
+from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+
+CHUNK = 128
+"""Scenes that one job renders."""
+SCENES = "scenes.jsonl"
+"""Written last: a folder that has it is complete."""
+
+
+def _write_chunk(source: SceneSource, out: Path, first: int, last: int) -> int:
+    """Images of scenes `first` to `last`, then their lines and voxels, which mark the chunk as done."""
+    rows: list[dict[str, Any]] = []
+    voxels: dict[str, np.ndarray] = {}
+    for index in range(first, last):
+        rendered = source.render(index)
+        name = f"images/{index:06d}.png"
+        with atomic_path(out / name) as temporary:
+            Image.fromarray(rendered.image).save(temporary)
+        rows.append(record_of(rendered, name))
+        for label in rendered.labels:
+            voxels.setdefault(label.instance, label.item.voxels)
+    parts = out / ".parts"
+    with atomic_path(parts / f"{first:06d}.npz") as temporary:
+        np.savez(temporary, **voxels)  # type: ignore[arg-type]
+    write_jsonl(parts / f"{first:06d}.jsonl", rows)
+    return last - first
+
+
+def write_scenes(out: str | os.PathLike[str], source: SceneSource, count: int, workers: int = 1) -> dict[str, Any]:
+    """Write the first `count` scenes of a source; a run that was killed is resumed by calling it again.
+
+    Args:
+        out: folder of the data set, made when missing.
+        source: the scenes.
+        count: how many.
+        workers: processes; the files do not depend on it.
+
+    Returns:
+        `{"scenes": n, "objects": n, "instances": n}`.
+
+    Raises:
+        InputError: `count` is not positive, or the folder holds another data set.
+    """
+    if count < 1:
+        raise input_error("number of scenes", got=count, expected="at least 1")
+    out = Path(out)
+    description = {"count": count, **source.describe()}
+    made = out / "source.json"
+    if made.is_file():
+        if read_json(made) != _plain(description):
+            raise input_error(
+                "the folder holds other scenes", got=out, expected="a new folder, or the same options to resume",
+                do="choose another --out or delete it",
+            )  # fmt: skip
+    elif out.is_dir() and any(out.iterdir()):
+        raise input_error("the folder is not empty", got=out, expected="a new folder", do="choose another --out")
+    else:
+        write_json(made, description)
+    if not (out / SCENES).is_file():
+        _render_missing(out, source, count, workers)
+        _join(out, count)
+    rows = [row for _, row in read_jsonl(out / SCENES)]
+    objects = [thing for row in rows for thing in row["objects"]]
+    return {"scenes": len(rows), "objects": len(objects), "instances": len({o["instance"] for o in objects})}
+
+
+def _plain(value: Any) -> Any:
+    """The value as it comes back from JSON: tuples are lists."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _render_missing(out: Path, source: SceneSource, count: int, workers: int) -> None:
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    chunks = [(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
+    missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]
+    jobs = [(_write_chunk, (source, out, first, last)) for first, last in missing]
+    done = count - sum(last - first for first, last in missing)
+    with tqdm(total=count, initial=done, desc="writing scenes", unit="scene", disable=None) as bar:
+        for number in parallel(jobs, workers):
+            bar.update(number)
+
+
+def _join(out: Path, count: int) -> None:
+    """Join the chunks: voxels first, the lines last."""
+    parts = out / ".parts"
+    voxels: dict[str, np.ndarray] = {}
+    rows: list[dict[str, Any]] = []
+    for first in range(0, count, CHUNK):
+        with np.load(parts / f"{first:06d}.npz", allow_pickle=False) as stored:
+            voxels.update(stored)
+        rows.extend(row for _, row in read_jsonl(parts / f"{first:06d}.jsonl"))
+    with atomic_path(out / "voxels.npz") as temporary:
+        np.savez_compressed(temporary, **dict(sorted(voxels.items())))  # type: ignore[arg-type]
+    write_jsonl(out / SCENES, rows)
+    shutil.rmtree(parts)

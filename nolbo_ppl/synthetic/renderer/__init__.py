@@ -1,0 +1,1 @@
+"""Ray casting, shading, materials and smooth edges."""

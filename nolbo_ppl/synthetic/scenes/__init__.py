@@ -1,0 +1,1 @@
+"""Random scenes: composed, rendered, labelled."""

@@ -1,0 +1,165 @@
+"""Scenes and their labels: render a composed scene and say what is known of each object in it.
+
+An image does not change when an object's size and distance grow together. Scenes are composed in units of their own
+(see `nolbo_ppl.synthetic.scenes.scene_sampler`), and the labels are the same objects scaled about the camera to their real size:
+rotation, size and position of each label agree exactly with the perspective of its pixels, while distances between
+different objects of a scene are not those of one real place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.synthetic.assets.shape_library import Item
+from nolbo_ppl.synthetic.renderer.camera_view import Placed, View
+from nolbo_ppl.synthetic.renderer.ray_casting import Hits, average_down, image_window, shade, to_display, trace
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One labelled object of a scene, in the scene's units."""
+
+    R_camera_object: Float[np.ndarray, "3 3"]
+    centre: Float[np.ndarray, " 3"]
+    """Box centre in the camera frame, scene units."""
+    diagonal: float
+    """Box diagonal, scene units."""
+    item: Item
+    """What it was drawn from."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything needed to render one image."""
+
+    view: View
+    objects: tuple[SceneObject, ...]
+    exposure: float
+    blur: float
+    noise: float
+    noise_seed: int
+    supersample: int
+    least_visibility: float
+    least_box: float
+
+
+@dataclass(frozen=True)
+class ObjectLabel:
+    """What is known of one object of an image."""
+
+    category: str
+    instance: str
+    box: Float[np.ndarray, " 4"]
+    """Tight box [x0, y0, x1, y1] px of the whole (amodal) silhouette: of the projected vertices, cut to the image."""
+    R_camera_object: Float[np.ndarray, "3 3"]
+    """Egocentric rotation."""
+    position: Float[np.ndarray, " 3"]
+    """Box centre in the camera frame, m."""
+    size: float
+    """Box diagonal, m."""
+    dimensions: Float[np.ndarray, " 3"]
+    """Side lengths of the box along the object's axes, m."""
+    visibility: float
+    """Pixels seen over pixels of the silhouette without anything before it, its part beyond the border included."""
+    symmetry: int
+    item: Item
+    """The shape, with the number of the instance in its pool."""
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """An image with its labels."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    intrinsics: Float[np.ndarray, " 4"]
+    labels: tuple[ObjectLabel, ...]
+    owner: Int[np.ndarray, "h w"]
+    """Number of the label each pixel shows, or -1 (at the first ray of the pixel)."""
+
+
+def amodal_box(placed: Placed, view: View) -> Float[np.ndarray, " 4"]:
+    """Tight box of the projected vertices, cut to the image."""
+    window = image_window(placed, view.intrinsics)
+    if window is None:
+        raise input_error("object behind the camera", got=placed.offset.tolist(), expected="every vertex at z > 0")
+    return np.clip(window, 0, [view.width, view.height, view.width, view.height])
+
+
+def _fine(view: View, factor: int) -> View:
+    """The same view with `factor` times as many rays along each side."""
+    if factor == 1:
+        return view
+    return replace(
+        view, height=view.height * factor, width=view.width * factor, intrinsics=view.intrinsics * factor,
+        backdrop=replace(view.backdrop, picture=_enlarge(view.backdrop.picture, factor)),
+    )  # fmt: skip
+
+
+def _enlarge(picture: np.ndarray | None, factor: int) -> np.ndarray | None:
+    return None if picture is None else picture.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def _seen_objects(scene: Scene, view: View) -> tuple[View, Hits, dict[int, float]]:
+    """Take objects that are hardly seen out of the view, until all that remain are seen; also their visibilities."""
+    while True:
+        hits = trace(view)
+        visibility, gone = {}, set()
+        for placed in view.placed:
+            if placed.owner < 0:
+                continue
+            covered = hits.owner_silhouette[placed.owner]
+            visibility[placed.owner] = hits.owner_visible[placed.owner] / covered if covered else 0.0
+            box = amodal_box(placed, scene.view)
+            side = min(box[2] - box[0], box[3] - box[1])
+            if visibility[placed.owner] < scene.least_visibility or side < scene.least_box:
+                gone.add(placed.owner)
+        if not gone:
+            return view, hits, visibility
+        view = replace(view, placed=tuple(p for p in view.placed if p.owner < 0 or p.owner not in gone))
+
+
+def _blurred(colour: np.ndarray, scale: float) -> np.ndarray:
+    """Gaussian blur of a small scale (px): five taps along each axis."""
+    if scale < 0.2:
+        return colour
+    weight = np.exp(-0.5 * (np.arange(-2, 3) / scale) ** 2).astype(np.float32)
+    weight /= weight.sum()
+    height, width = colour.shape[:2]
+    padded = np.pad(colour, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    rows = sum(w * padded[k : k + height] for k, w in enumerate(weight))
+    return sum(w * rows[:, k : k + width] for k, w in enumerate(weight))
+
+
+def render_scene(scene: Scene) -> Rendered:
+    """Render a scene and label every object that is seen in it.
+
+    Objects of which too little is seen (`SceneConfig.least_visibility`, `least_box`) are taken out of the scene before
+    it is shaded, so that no image shows an object that its labels lack.
+    """
+    factor = scene.supersample
+    view, hits, visibility = _seen_objects(scene, _fine(scene.view, factor))
+    colour = _blurred(average_down(shade(view, hits), factor), scene.blur)
+    noise = np.random.default_rng(scene.noise_seed).standard_normal(colour.shape, dtype=np.float32)
+    image = to_display(colour, scene.exposure, np.float32(scene.noise) * noise)
+    labels: list[ObjectLabel] = []
+    number = np.full(len(view.placed) + 1, -1)
+    for k, placed in enumerate(view.placed):
+        if placed.owner < 0:
+            continue
+        number[k] = len(labels)
+        labels.append(_label(scene.objects[placed.owner], amodal_box(placed, scene.view), visibility[placed.owner]))
+    owner = number[hits.index[::factor, ::factor]]
+    return Rendered(image, scene.view.intrinsics, tuple(labels), owner)
+
+
+def _label(thing: SceneObject, box: np.ndarray, visibility: float) -> ObjectLabel:
+    shape = thing.item.shape
+    return ObjectLabel(
+        category=shape.category, instance=shape.instance, box=box, R_camera_object=thing.R_camera_object,
+        position=thing.centre * (shape.diagonal / thing.diagonal), size=shape.diagonal, dimensions=shape.dimensions,
+        visibility=min(1.0, visibility), symmetry=shape.symmetry, item=thing.item,
+    )  # fmt: skip

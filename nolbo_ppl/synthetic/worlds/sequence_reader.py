@@ -1,0 +1,162 @@
+"""Drives read back: true poses, objects and what each frame shows, with errors that name file and line."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import is_rotation
+from nolbo_ppl.io.files import read_json, read_jsonl
+from nolbo_ppl.io.scenes import ObjectRecord, image_field, parse_record
+from nolbo_ppl.io.trajectories import read_trajectory
+from nolbo_ppl.synthetic.worlds.sequence_folder import DRIVE, INTRINSICS, OBJECTS, SCENES, TIMES, TRUTH, VOXELS, read_image
+
+
+@dataclass(frozen=True)
+class DriveObject:
+    """One true object of a drive."""
+
+    id: str
+    category: str
+    instance: str
+    symmetry: int
+    T_world_object: Float[np.ndarray, "4 4"]
+    """Pose of its box centre; of a moving object, in the first frame."""
+    diagonal: float
+    """Box diagonal, m."""
+    dimensions: Float[np.ndarray, " 3"]
+    """Side lengths of the box, m."""
+    moving: bool
+
+
+@dataclass(frozen=True)
+class DriveFrame:
+    """What one frame shows."""
+
+    image: Path
+    ids: tuple[str, ...]
+    objects: tuple[ObjectRecord, ...]
+    """In the order of `ids`."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive folder."""
+
+    path: Path
+    intrinsics: Float[np.ndarray, " 4"]
+    size: tuple[int, int]
+    """Width and height of the images, px."""
+    T_world_camera: Float[np.ndarray, "n 4 4"]
+    times: Float[np.ndarray, " n"]
+    objects: tuple[DriveObject, ...]
+    frames: tuple[DriveFrame, ...]
+    facts: dict[str, Any]
+    """The content of `drive.json`."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def image(self, frame: int) -> UInt8[np.ndarray, "h w 3"]:
+        """The image of a frame."""
+        return read_image(self.frames[frame].image)
+
+    def voxels(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
+        """Packed 32^3 occupancy of each instance; see `nolbo_ppl.geometry.voxels.unpack_voxels`."""
+        with np.load(self.path / VOXELS, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+
+
+def _numbers(value: object, shape: tuple[int, ...]) -> np.ndarray | None:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return array if array.shape == shape and np.isfinite(array).all() else None
+
+
+def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
+    """Read `objects.json`.
+
+    Raises:
+        InputError: missing, malformed, or an entry lacks something; names the entry.
+    """
+    rows = read_json(path)
+    if not isinstance(rows, list):
+        raise input_error("true objects", got=type(rows).__name__, expected="a list of objects", file=path)
+    found: list[DriveObject] = []
+    for number, row in enumerate(rows):
+        where = f"entry {number}: "
+        if not isinstance(row, dict) or not isinstance(row.get("id"), str):
+            raise input_error(where + "id", got=row, expected='an object with a name "id"', file=path)
+        if row.get("category") not in CATEGORIES:
+            raise input_error(where + "category", got=row.get("category"), expected=", ".join(CATEGORIES), file=path)
+        T = _numbers(row.get("T_world_object"), (4, 4))
+        if T is None or not bool(is_rotation(T[:3, :3], tolerance=1e-3)):
+            raise input_error(where + "T_world_object", got=row.get("T_world_object"), expected="a 4 x 4 pose", file=path)
+        dimensions, diagonal = _numbers(row.get("dimensions"), (3,)), _numbers(row.get("diagonal"), ())
+        if dimensions is None or diagonal is None or diagonal <= 0:
+            got = f"{row.get('dimensions')}, {row.get('diagonal')}"
+            raise input_error(where + "dimensions, diagonal", got=got, expected="metres", file=path)
+        found.append(
+            DriveObject(
+                row["id"], row["category"], str(row.get("instance", "")), int(row.get("symmetry", 1)), T,
+                float(diagonal), dimensions, bool(row.get("moving", False)),
+            )
+        )  # fmt: skip
+    if len({thing.id for thing in found}) != len(found):
+        raise input_error("true objects", got="two with one id", expected="each id once", file=path)
+    return tuple(found)
+
+
+def read_drive(path: str | os.PathLike[str]) -> Drive:
+    """Read a drive folder; images are read when asked for.
+
+    Raises:
+        InputError: not a complete drive, or a file of it is malformed; names file and line.
+    """
+    path = Path(path)
+    if not (path / SCENES).is_file() or not (path / DRIVE).is_file():
+        raise input_error(
+            "not a complete drive", got=path, expected=f"a folder with {DRIVE} and {SCENES}",
+            do="write it with nolbo drive --out, which also resumes a drive that was stopped",
+        )  # fmt: skip
+    camera = read_json(path / INTRINSICS)
+    try:
+        intrinsics = np.array([float(camera[name]) for name in ("fx", "fy", "cx", "cy")])
+        size = (int(camera["width"]), int(camera["height"]))
+    except (KeyError, TypeError, ValueError):
+        raise input_error(
+            "intrinsics", got=camera, expected='{"fx", "fy", "cx", "cy", "width", "height"}', file=path / INTRINSICS
+        ) from None
+    objects = read_objects(path / OBJECTS)
+    poses = read_trajectory(path / TRUTH).T_world_camera
+    try:
+        times = np.loadtxt(path / TIMES, ndmin=1)
+    except (OSError, ValueError) as error:
+        raise input_error("times", got=error, expected="one number a line", file=path / TIMES) from None
+    frames = tuple(_frames(path, size, {thing.id for thing in objects}))
+    if not len(frames) == len(poses) == len(times):
+        raise input_error(
+            "lengths differ", got=f"{len(frames)} frames, {len(poses)} poses, {len(times)} times", expected="equal", file=path
+        )
+    return Drive(path, intrinsics, size, poses, times, objects, frames, read_json(path / DRIVE))
+
+
+def _frames(path: Path, size: tuple[int, int], known: set[str]) -> list[DriveFrame]:
+    file, frames = path / SCENES, []
+    for line, row in read_jsonl(file):
+        record = parse_record(row, file, line, CATEGORIES, size, image_field(row, path, file, line))
+        ids = tuple(str(thing.get("id")) for thing in row["objects"])
+        unknown = [name for name in ids if name not in known]
+        if unknown:
+            raise input_error("id", got=unknown[0], expected=f"one of {OBJECTS}", file=file, line=line)
+        frames.append(DriveFrame(record.image, ids, record.objects))
+    return frames

@@ -1,0 +1,1 @@
+"""Training: configuration, stages, data, checkpoints, validation and calibration."""

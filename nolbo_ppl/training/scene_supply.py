@@ -1,0 +1,215 @@
+"""What the trainer asks for: the batch of a step, with the teacher's latents, augmented; and batches of shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from nolbo_ppl.data.augment import Augmentation, augment
+from nolbo_ppl.data.loader import Scenes, batch_indices
+from nolbo_ppl.data.mirror import mirror, mirror_voxels
+from nolbo_ppl.data.scene_cache import CachedScenes
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.models.shape_vae import ShapeBatch
+from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
+from nolbo_ppl.training.stages import seeded_noise
+
+
+def to_batch(arrays: Arrays) -> SceneBatch:
+    """Arrays of a loader as the batch that story and guide take."""
+    return SceneBatch(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()})
+
+
+class Part:
+    """Some scenes of a data set as a data set."""
+
+    def __init__(self, scenes: Scenes, index: Int[np.ndarray, " n"]) -> None:
+        self.scenes, self.index = scenes, index
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def batch(self, indices: Int[np.ndarray, " b"]) -> Arrays:
+        """The scenes of these numbers."""
+        return self.scenes.batch(self.index[np.asarray(indices)])
+
+
+class Joined:
+    """Several data sets of one pool of shapes, one after the other."""
+
+    def __init__(self, parts: Sequence[CachedScenes]) -> None:
+        self.parts = parts
+        self._first = np.cumsum([0, *(len(part) for part in parts)])
+
+    def __len__(self) -> int:
+        return int(self._first[-1])
+
+    def batch(self, indices: Int[np.ndarray, " b"]) -> Arrays:
+        """The scenes of these numbers."""
+        index = np.asarray(indices)
+        owner = np.searchsorted(self._first, index, side="right") - 1
+        result: Arrays = {}
+        for number, part in enumerate(self.parts):
+            rows = np.flatnonzero(owner == number)
+            if not len(rows):
+                continue
+            for name, value in part.batch(index[rows] - self._first[number]).items():
+                if name not in result:
+                    result[name] = np.empty((len(index), *value.shape[1:]), value.dtype)
+                result[name][rows] = value
+        return result
+
+    def shapes(self) -> tuple[Int[np.ndarray, " n"], UInt8[np.ndarray, "n bytes"], Int[np.ndarray, " n"]]:
+        """Number, voxels and category of every shape, each once."""
+        number, packed, category = (np.concatenate(values) for values in zip(*(part.shapes() for part in self.parts)))
+        number, first = np.unique(number, return_index=True)
+        return number, packed[first], category[first]
+
+
+class ShapeTable:
+    """Every labelled shape of a data set once, in the order of its number.
+
+    Args:
+        number: number of each shape, ascending.
+        packed: its voxels, packed bits.
+        category: its category label.
+        known: names of instances with labels of their own are numbered below this; others are "novel".
+    """
+
+    def __init__(
+        self,
+        number: Int[np.ndarray, " n"],
+        packed: UInt8[np.ndarray, "n bytes"],
+        category: Int[np.ndarray, " n"],
+        known: int = 0,
+    ) -> None:
+        self.number, self.known = number, known
+        self.packed, self.category = torch.from_numpy(packed), torch.from_numpy(category)
+        self.loc: Float[Tensor, "n d"] | None = None
+        self.scale: Float[Tensor, "n d"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def batch(self, size: int, seed: int, step: int, latent_dim: int, part: slice = slice(None)) -> ShapeBatch:
+        """The shapes of a training step, every epoch a new permutation; depends on seed and step only."""
+        index = torch.from_numpy(batch_indices(len(self), size, seed, step))[part]
+        instance = torch.from_numpy(self.number)[index]
+        instance = torch.where(instance < self.known, instance, -1)
+        noise = seeded_noise(seed, step, size, latent_dim)[part]
+        return ShapeBatch(self.packed[index], self.category[index], instance, noise)
+
+    @torch.no_grad()
+    def teach(self, model: Nolbo, mirrored: bool = False) -> None:
+        """Let the trained shape guide encode every shape: the truth of the shape latent in later stages.
+
+        Args:
+            model: the networks.
+            mirrored: encode every shape's mirror image too.
+        """
+        model.shape_guide.eval()
+        sides = [self.packed, mirror_voxels(self.packed)] if mirrored and len(self) else [self.packed]
+        parts = [model.shape_guide.posterior(part) for side in sides for part in side.split(256)]
+        self.loc = torch.cat([loc for loc, _ in parts])
+        self.scale = torch.cat([scale for _, scale in parts])
+
+    def add_teacher(self, batch: SceneBatch, mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
+        """The batch with the teacher's posterior of each object; a shape that is not in the table is unknown.
+
+        Args:
+            batch: scenes with the numbers of their shapes.
+            mirrored: scenes that will be mirrored; the table must have been taught both sides.
+
+        Raises:
+            InputError: mirrored scenes, of a table that knows no mirrored shape.
+        """
+        if self.loc is None or self.scale is None or len(self) == 0:
+            return batch.replace(has_voxels=torch.zeros_like(batch.has_voxels)) if len(self) == 0 else batch
+        row = torch.from_numpy(np.searchsorted(self.number, batch.instance.numpy()).clip(0, len(self) - 1))
+        known = torch.from_numpy(self.number)[row] == batch.instance
+        if mirrored is not None:
+            if len(self.loc) != 2 * len(self):
+                raise input_error("latents of mirrored shapes", got="a table taught one side", do="teach(model, mirrored=True)")
+            row = row + mirrored[:, None] * len(self)
+        return batch.replace(
+            shape_loc=self.loc[row], shape_scale=self.scale[row], has_voxels=batch.has_voxels & known,
+            shape_index=torch.where(known, row, -1),
+        )  # fmt: skip
+
+
+class SceneSupply:
+    """Shuffled, augmented batches of scenes; step s is a function of (seed, s) alone, whatever came before.
+
+    Args:
+        scenes: the data set.
+        table: its shapes, for the teacher's latents.
+        batch_size: scenes of the joint batch over all processes.
+        seed: seed of order, augmentation and noise.
+        latent_dim: dimensions of the shape latent, for its noise.
+        augmentation: what is done to the images, None for nothing.
+        size: longer side images are brought to, px, a multiple of 32; None for the data set's own.
+        sizes: sides to choose from in its place, a step.
+        known_instances: numbers below this are instance labels of the model.
+        rank: number of this process.
+        world: number of processes; each takes an equal part of the joint batch.
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        table: ShapeTable,
+        batch_size: int,
+        seed: int,
+        latent_dim: int,
+        augmentation: Augmentation | None = None,
+        size: int | None = None,
+        sizes: Sequence[int] | None = None,
+        known_instances: int = 0,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
+        if batch_size % world:
+            raise input_error("batch size", got=batch_size, expected=f"a multiple of the {world} processes")
+        self.scenes, self.table, self.batch_size, self.seed = scenes, table, batch_size, seed
+        self.latent_dim, self.augmentation, self.known = latent_dim, augmentation, known_instances
+        self.size, self.sizes = size, tuple(sizes) if sizes else ()
+        self.part = slice(rank * batch_size // world, (rank + 1) * batch_size // world)
+
+    def batch(self, step: int) -> SceneBatch:
+        """The batch of a step (this process's part of it)."""
+        index = batch_indices(len(self.scenes), self.batch_size, self.seed, step)[self.part]
+        generator = np.random.default_rng([self.seed, step, 1])
+        mirrored = None
+        if self.augmentation is not None and self.augmentation.mirror_probability > 0:
+            drawn = np.random.default_rng([self.seed, step, 2]).random(self.batch_size)[self.part]
+            mirrored = torch.from_numpy(drawn < self.augmentation.mirror_probability)
+        batch = self._labelled(index, mirrored)
+        size = int(generator.choice(self.sizes)) if self.sizes else self._other(batch)
+        if self.augmentation is not None or size is not None:
+            seeds = generator.integers(2**63, size=self.batch_size)[self.part]
+            batch = augment(batch, self.augmentation, seeds, size)
+        noise = seeded_noise(self.seed, step, self.batch_size, batch.box.shape[1], self.latent_dim)
+        return batch.replace(noise=noise[self.part])
+
+    def prepared(self, index: Int[np.ndarray, " b"]) -> SceneBatch:
+        """Scenes of these numbers without augmentation, with the teacher's latents."""
+        batch = self._labelled(index)
+        size = self._other(batch)
+        return batch if size is None else augment(batch, None, np.zeros(len(index), dtype=np.int64), size)
+
+    def _other(self, batch: SceneBatch) -> int | None:
+        """The side images are brought to, or None where they have it."""
+        return None if self.size is None or self.size == max(batch.image.shape[-2:]) else self.size
+
+    def _labelled(self, index: Int[np.ndarray, " b"], mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
+        """Scenes of these numbers as they are, or mirrored, with the teacher's latents."""
+        batch = self.table.add_teacher(to_batch(self.scenes.batch(index)), mirrored)
+        if mirrored is not None:
+            batch = mirror(batch, mirrored)
+        return batch.replace(instance=torch.where(batch.instance < self.known, batch.instance, -1))

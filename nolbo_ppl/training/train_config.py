@@ -1,0 +1,223 @@
+"""The configuration of a training run, and the stages it stands for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from nolbo_ppl.categories import CATEGORY_SYMMETRY
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.elbo import SHAPE_STAGE
+from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.models.model_config import PRESETS, ModelConfig
+from nolbo_ppl.training.net2net import grown_config
+from nolbo_ppl.training.stages import Stage, scene_weights
+
+DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
+"""Where rendered scenes are kept between runs."""
+FREE_FIELDS = (
+    "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
+)
+"""Fields a resumed run may change: they do not touch what is learnt."""
+OPTIONAL_FIELDS = ("categories", "symmetry", "grow")
+"""Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything a training run depends on."""
+
+    out: Path = Path("runs/tiny")
+    """Folder of the run: configuration, metrics.jsonl, checkpoint, and at the end the model."""
+    preset: Literal["nano", "tiny", "paper"] = "tiny"
+    """Networks: `tiny` for CPUs, `paper` for darknet19 and 64^3 voxels, `nano` for demonstrations."""
+    objective: Literal["inclusive", "elbo", "paper"] = "inclusive"
+    """What is maximised: the inclusive objective, the pure bound, or the paper's (the bound with objectness turned)."""
+    orientation: Literal["mixture", "angle", "sincos"] | None = None
+    """Form of the orientation latent; the preset's by default."""
+    instance_labels: bool = False
+    """Give every instance of `scenes` a label: the latent is split in halves for category and instance."""
+    categories: tuple[str, ...] = ()
+    """Names of your own categories, in the order of their labels; the preset's by default."""
+    symmetry: tuple[int, ...] = ()
+    """Symmetry of each of `categories` about the vertical axis: 1 none, n for n-fold, 0 free; by default that of
+    `nolbo_ppl.categories` for the names known there, and 1 for others."""
+    latent_dim: int | None = None
+    """Dimensions of the shape latent; the preset's by default."""
+    image_size: int | None = None
+    """Side in px of the images the network looks at, a multiple of 32; the preset's, or the initial weights', by default."""
+    scenes: Path | None = None
+    """Folder of a data set written by `nolbo scenes`, or of your own; without it scenes are generated."""
+    validation: Path | None = None
+    """Folder of held-out scenes; with `scenes` and without this, the last tenth of `scenes` is held out."""
+    count: int = 16384
+    """Number of generated training scenes."""
+    single_count: int = 1024
+    """Number of generated scenes with one object, for the second stage."""
+    difficulty: Literal["easy", "standard", "full", "mixed"] = "standard"
+    """Difficulty of the generated scenes; `mixed` is a third standard, a third full, and a third views of worlds to drive
+    through (`nolbo_ppl.synthetic.worlds`)."""
+    backgrounds: Path | None = None
+    """Folder of photographs behind the generated scenes (with `mixed`, behind the full ones)."""
+    initial: str | None = None
+    """Weights to start from: a name of shipped weights, or the folder of a model; the networks' configuration is theirs.
+    With `--shape-steps 0` the shape networks stay as they are."""
+    grow: bool = False
+    """Grow the initial networks to the blocks and the second look of the preset (`nolbo_ppl.training.net2net`)."""
+    cache: Path = DEFAULT_CACHE
+    """Where generated scenes are kept."""
+    seed: int = 0
+    """Seed of weights, scenes, order, augmentation and noise."""
+    shape_steps: int = 1200
+    """Steps of the shape autoencoder."""
+    single_steps: int = 60
+    """Steps on images of one object."""
+    scene_steps: int = 4000
+    """Steps on scenes."""
+    freeze: float = 1.0
+    """Share of the scene steps during which decoder and prior networks stay frozen."""
+    decode: int = 12
+    """Objects decoded a step where the objective has voxels; their term stands for all objects."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """Weights of single terms (names: `nolbo_ppl.inference.elbo`) in place of the objective's own, as `voxels 0.002`."""
+    average_every: int = 1
+    """With several processes (`torchrun`): steps that each makes by itself before their weights are averaged; at 1 they
+    share every step, as one process with the joint batch would make it."""
+    batch: int = 64
+    """Scenes a step, over all processes."""
+    shape_batch: int = 32
+    """Shapes a step."""
+    learning_rate: float = 2.5e-3
+    """Rate of the stages on images after their warm-up."""
+    optimizer: Literal["muon", "adamw"] = "muon"
+    """Optimiser of the stages on images; shapes are learnt by AdamW."""
+    sizes: tuple[int, ...] = ()
+    """Image sides to choose from each step, multiples of 32; empty for the preset's own."""
+    augment: bool = True
+    """Blur, colour, scale and translation at random; half the scenes mirrored."""
+    mirror: bool = True
+    """Mirror scenes with their labels and shapes, where images are augmented; never with instance labels, for a mirrored
+    instance is another one. Leave it out where left and right set categories apart."""
+    bf16: bool = True
+    """Networks in bfloat16."""
+    threads: int = 0
+    """Threads of torch; 0 leaves torch's own choice."""
+    workers: int = 2
+    """Processes that render scenes."""
+    log_every: int = 20
+    """Steps between rows of metrics.jsonl."""
+    evaluate_every: int = 1000
+    """Steps between looks at the held-out scenes."""
+    evaluate_scenes: int = 512
+    """Held-out scenes of each look; the calibration at the end uses all."""
+    checkpoint_every: int = 100
+    """Steps between checkpoints."""
+    tensorboard: bool = False
+    """Write TensorBoard files into the run's folder too (needs the extra `tensorboard`)."""
+    resume: bool = True
+    """Go on from the run's checkpoint where there is one; otherwise a folder with a checkpoint is refused."""
+
+    def __post_init__(self) -> None:
+        at_least_one = (
+            "batch", "shape_batch", "log_every", "evaluate_every", "checkpoint_every", "count", "workers", "average_every"
+        )  # fmt: skip
+        for name in at_least_one:
+            if getattr(self, name) < 1:
+                raise input_error(name, got=getattr(self, name), expected="at least 1")
+        if self.checkpoint_every % self.average_every:
+            raise input_error(
+                "checkpoint_every", got=self.checkpoint_every, expected=f"a multiple of average_every, {self.average_every}",
+                do="a run goes on exactly only from where the weights of all processes were averaged",
+            )
+        if not 0 <= self.freeze <= 1:
+            raise input_error("freeze", got=self.freeze, expected="a share from 0 to 1")
+        if any(size % 32 or size <= 0 for size in self.sizes):
+            raise input_error("sizes", got=self.sizes, expected="positive multiples of 32")
+        if self.grow and self.initial is None:
+            raise input_error("networks to grow", got="no initial weights", do="give --initial, or leave --grow out")
+        if self.instance_labels and self.scenes is None:
+            raise input_error("instance labels", got="generated scenes", do="give --scenes with its own instances")
+        if self.validation is not None and self.scenes is None:
+            raise input_error("held-out scenes without training scenes", do="give --scenes too")
+        if self.categories and self.scenes is None:
+            raise input_error("own categories", got="generated scenes, which show the twelve of `nolbo_ppl.categories`",
+                              do="give --scenes with labels of these names")
+        if self.symmetry and len(self.symmetry) != len(self.categories):
+            raise input_error("symmetry", got=f"{len(self.symmetry)} for {len(self.categories)} categories",
+                              expected="one for each of --categories")
+        if any(order < 0 for order in self.symmetry):
+            raise input_error("symmetry", got=self.symmetry, expected="1 (none), n (n-fold) or 0 (free) for each category")
+
+    def model(self) -> ModelConfig:
+        """Configuration of the networks. Raises `InputError` where initial weights and other fields disagree."""
+        if self.initial is not None:
+            config = load(self.initial).config
+            if self.orientation not in (None, config.orientation) or self.latent_dim not in (None, config.latent_dim):
+                raise input_error(
+                    "initial weights of another form", got=f"orientation {config.orientation}, {config.latent_dim} dimensions",
+                    do="leave --orientation and --latent-dim out",
+                )
+            if self.categories not in ((), config.categories) or self.symmetry not in ((), config.symmetry):
+                raise input_error(
+                    "initial weights of other categories",
+                    got=f"{' '.join(config.categories)} of symmetry {' '.join(map(str, config.symmetry))}",
+                    expected=f"{' '.join(self.categories)} of symmetry {' '.join(map(str, self._symmetry()))}",
+                    do="leave --categories and --symmetry out, or train without --initial",
+                )
+            if self.grow:
+                config = grown_config(config, PRESETS[self.preset]())
+            return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)
+        changes: dict[str, Any] = {}
+        if self.categories:
+            changes["categories"], changes["symmetry"] = self.categories, self._symmetry()
+        if self.image_size is not None:
+            changes["image_size"] = self.image_size
+        if self.orientation is not None:
+            changes["orientation"] = self.orientation
+            changes["azimuth_components"] = 4 if self.orientation == "mixture" else 1
+        if self.latent_dim is not None:
+            changes["latent_dim"] = self.latent_dim
+        return dataclasses.replace(PRESETS[self.preset](), **changes)
+
+    def _symmetry(self) -> tuple[int, ...]:
+        """Declared symmetry of each of `categories`."""
+        return self.symmetry or tuple(CATEGORY_SYMMETRY.get(name, 1) for name in self.categories)
+
+    def stages(self) -> list[Stage]:
+        """The stages that have steps."""
+        weights = scene_weights(self.objective, self.weights)
+        images = OptimisationConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
+        stages = [
+            Stage(
+                "shapes",
+                OptimisationConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
+                SHAPE_STAGE,
+            ),
+            Stage(
+                "single",
+                dataclasses.replace(images, steps=self.single_steps, decay=0.0, warmup=min(100, self.single_steps)),
+                weights,
+                freeze=self.single_steps,
+            ),
+            Stage(
+                "scenes",
+                dataclasses.replace(images, steps=self.scene_steps, warmup=min(100, self.scene_steps)),
+                weights,
+                freeze=round(self.freeze * self.scene_steps),
+                decode=self.decode if weights.get("voxels") else 0,
+            ),
+        ]
+        return [stage for stage in stages if stage.optimisation.steps > 0]
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON keeps it."""
+        return json.loads(json.dumps(dataclasses.asdict(self), default=str))
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must agree with: everything but the fields that do not touch what is learnt."""
+        values = self.to_json()
+        return {k: v for k, v in values.items() if k not in FREE_FIELDS and (v or k not in OPTIONAL_FIELDS)}

@@ -1,0 +1,149 @@
+"""Training: stochastic variational inference in stages, from shapes to single objects to scenes.
+
+Stages (NOLBO, training details; docs/training.md): the shape autoencoder (decoder, prior networks, 3D encoder); the
+guide on images of one object; the guide on scenes, decoder and prior frozen. Every batch is a function of the seed and
+the step, checkpoints hold all that a step changes, and a killed run goes on exactly where its last checkpoint stands.
+Started by `torchrun`, several processes or machines share each batch.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+import torch.distributed as distributed
+from tqdm import tqdm
+
+from nolbo_ppl._version import __version__
+from nolbo_ppl.data.loader import prefetch
+from nolbo_ppl.inference import svi as optimisation
+from nolbo_ppl.inference.posterior.model_folder import load, save
+from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.posterior_calibration import Calibration
+from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
+from nolbo_ppl.training.net2net import grow
+from nolbo_ppl.training.stage_data import TrainingData
+from nolbo_ppl.training.stages import StageRun
+from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
+from nolbo_ppl.training.training_log import Journal
+from nolbo_ppl.training.validation import held_out
+
+
+@dataclass
+class TrainSummary:
+    """What a run reports."""
+
+    out: Path
+    """Folder of the model."""
+    steps: int
+    """Optimiser steps made, over all stages."""
+    seconds: float
+    """Of this process, from start to end."""
+    waiting: float
+    """Share of the stages' time spent waiting for data."""
+    held_out: dict[str, float] = field(default_factory=dict)
+    """Held-out figures of the averaged weights at the end."""
+
+
+def run(config: TrainConfig) -> TrainSummary:
+    """Train as configured; returns when the model is written.
+
+    Raises:
+        InputError: the configuration or the data cannot be used, or the folder holds a run of another configuration.
+    """
+    started = time.perf_counter()
+    rank, world = _join()
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    data = TrainingData(config, rank, world)
+    model = Nolbo.from_seed(data.model, config.seed)
+    if config.initial is not None:
+        initial = load(config.initial).model
+        if config.grow:
+            initial = grow(initial, model.config, config.seed)
+        model.load_state_dict(initial.state_dict())
+    journal = Journal(config, rank)
+    stages = config.stages()
+    first, tensors, at_step = journal.resume(model, stages)
+    waited = busy = 0.0
+    for number, stage in enumerate(stages):
+        if number < first:
+            continue
+        if stage.name != "shapes":
+            data.teach(model)
+        stage_run = StageRun(model, stage, config.bf16, config.average_every)
+        if number == first and tensors is not None:
+            optimisation.restore(stage_run.state, tensors, at_step)
+        w, b = _train_stage(stage_run, number, data, journal, config)
+        waited, busy = waited + w, busy + b
+        stage_run.adopt_average()
+        journal.checkpoint(number + 1, model)
+    summary = TrainSummary(
+        config.out / "model",
+        sum(stage.optimisation.steps for stage in stages),
+        0.0,
+        waited / max(waited + busy, 1e-9),
+    )
+    if rank == 0:
+        model.set_half_precision(False)
+        calibration = Calibration()
+        if any(stage.name != "shapes" for stage in stages):
+            data.teach(model)
+            summary.held_out = held_out(model, data.validation(config.evaluate_scenes))
+            with suppress(TooFewObjects):  # a small folder of a user's own: the scales stay as they were learnt
+                calibration = calibrate(model, data.validation(None))
+        summary.seconds = time.perf_counter() - started
+        meta = {
+            "calibrated": calibration != Calibration(),
+            "training": config.to_json(),
+            "held_out": summary.held_out,
+            "versions": {"nolbo_ppl": __version__, "torch": torch.__version__},
+        }
+        save(config.out / "model", model, calibration, meta)
+        journal.close()
+    if world > 1:
+        distributed.barrier()
+        distributed.destroy_process_group()
+    return summary
+
+
+def _train_stage(
+    stage_run: StageRun, number: int, data: TrainingData, journal: Journal, config: TrainConfig
+) -> tuple[float, float]:
+    """Make the steps of a stage; returns the seconds waited for data and those spent on everything else."""
+    name, steps = stage_run.stage.name, stage_run.stage.optimisation.steps
+    waited, start = 0.0, time.perf_counter()
+    batches = data.batches(name, stage_run.state.step)
+    quiet = True if journal.rank else None
+    bar = tqdm(total=steps, initial=stage_run.state.step, desc=name, unit="step", disable=quiet)
+    with bar, batches if isinstance(batches, prefetch) else nullcontext():
+        while not stage_run.finished:
+            before = time.perf_counter()
+            batch = next(batches)
+            waited += time.perf_counter() - before
+            info = stage_run.step(batch)
+            bar.update()
+            at = stage_run.state.step
+            if at % config.log_every == 0 or at == steps:
+                scenes = len(batch.image) if isinstance(batch, SceneBatch) else len(batch.voxels)
+                journal.log(name, info, scenes, time.perf_counter() - start, waited)
+                bar.set_postfix(loss=f"{info.loss:.3f}")
+            if name != "shapes" and at % config.evaluate_every == 0 and at < steps and journal.rank == 0:
+                figures = held_out(stage_run.averaged(), data.validation(config.evaluate_scenes))
+                journal.write({"stage": name, "step": at, **figures})
+            if at % config.checkpoint_every == 0 and at < steps:
+                journal.checkpoint(number, stage_run)
+    return waited, time.perf_counter() - start - waited
+
+
+def _join() -> tuple[int, int]:
+    """Rank and number of processes; joins the group when `torchrun` started several."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world > 1 and not distributed.is_initialized():
+        distributed.init_process_group("gloo")
+    return (distributed.get_rank(), world) if world > 1 else (0, 1)

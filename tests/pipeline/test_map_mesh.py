@@ -1,0 +1,102 @@
+"""The map as GLB: read back, every shape lies where its landmark is, at its size, upright for a viewer; crops."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from nolbo_ppl.geometry.pose import make_pose, matrix_to_quaternion, so3_exp
+from nolbo_ppl.pipeline.map_mesh import build_scene, landmark_mesh, landmark_pose, write_glb
+from nolbo_ppl.pipeline.thumbnails import LONGEST, best_views, cut, write_crops
+
+
+def slab() -> np.ndarray:
+    """Occupancy of a slab: 0.8 x 0.4 x 0.2 of the box, along x, y, z."""
+    grid = np.zeros((20, 20, 20))
+    grid[2:18, 6:14, 8:12] = 1.0
+    return grid
+
+
+def row(name: str = "L0", **change: Any) -> dict[str, Any]:
+    return {"name": name, "position": [3.0, 0.5, 8.0], "existence": 0.9, "category": "car", "size": [2.0, 1.0, 2.0],
+            **change}  # fmt: skip
+
+
+def test_a_landmark_lies_at_its_place_at_its_size() -> None:
+    R = so3_exp(np.array([0.0, 0.7, 0.0]))
+    vertices, faces = landmark_mesh(row(rotation=matrix_to_quaternion(R).tolist()), slab())
+    local = (vertices - [3.0, 0.5, 8.0]) @ R  # the diagonal of [2, 1, 2] is 3 m
+    np.testing.assert_allclose(np.ptp(local, axis=0), 3.0 * np.array([0.8, 0.4, 0.2]), rtol=1e-6)
+    np.testing.assert_allclose((local.max(axis=0) + local.min(axis=0)) / 2, 0.0, atol=1e-6)
+    assert trimesh.Trimesh(vertices, faces).volume > 0  # faces look outwards
+
+
+def test_a_landmark_without_orientation_stands_upright() -> None:
+    """The object's z is up; the world's y is down."""
+    np.testing.assert_allclose(landmark_pose(row())[:3, 2], [0.0, -1.0, 0.0], atol=1e-12)
+
+
+def test_the_file_can_be_read_back(tmp_path: Path) -> None:
+    landmarks = [row(), row("L1", position=[-2.0, 0.0, 4.0], category="chair"), row("L2", existence=0.1), row("L3"),
+                 row("L4", detections=0.0)]  # fmt: skip
+    voxels = {"L0": slab(), "L1": 0.3 * slab(), "L2": slab(), "L4": slab()}
+    # L1 is nowhere sure, L2 hardly exists, L3 has no shape, L4 no detection.
+    path = make_pose(np.tile(np.eye(3), (4, 1, 1)), np.array([[0, 0, z] for z in range(4)], dtype=float))
+    write_glb(tmp_path / "map.glb", build_scene(landmarks, voxels, path))
+    scene = trimesh.load_scene(tmp_path / "map.glb")
+    assert set(scene.graph.nodes_geometry) == {"L0", "L1", "trajectory"}
+    for name, position in (("L0", [3.0, 0.5, 8.0]), ("L1", [-2.0, 0.0, 4.0])):
+        transform, geometry = scene.graph[name]
+        bounds = trimesh.transform_points(scene.geometry[geometry].vertices, transform)
+        middle = (bounds.max(axis=0) + bounds.min(axis=0)) / 2
+        # glTF has y up: the world's y (down) and z (forward) change their signs.
+        np.testing.assert_allclose(middle, np.array(position) * [1, -1, -1], atol=1e-4)
+    colours = [tuple(scene.geometry[scene.graph[name][1]].visual.material.baseColorFactor) for name in ("L0", "L1")]
+    assert colours[0] != colours[1]
+
+
+def test_an_empty_map_is_a_file_too(tmp_path: Path) -> None:
+    write_glb(tmp_path / "map.glb", build_scene([], {}, np.eye(4)[None]))
+    assert (tmp_path / "map.glb").stat().st_size > 0
+
+
+def test_best_views_weigh_probability_objectness_and_size(tmp_path: Path) -> None:
+    seen = [
+        {"frame": 0, "box": [0, 0, 10, 10], "objectness": 0.9},
+        {"frame": 1, "box": [0, 0, 40, 40], "objectness": 0.5},
+        {"frame": 2, "box": [0, 0, 50, 50], "objectness": 0.9},
+        {"frame": 2, "position": [0, 0, 1]},  # from a detector without boxes
+    ]
+    found = [{"landmarks": {"L0": 1.0}}, {"landmarks": {"L0": 1.0}}, {"landmarks": {"L0": 0.1, "L1": 0.8}},
+             {"landmarks": {"L1": 1.0}}]  # fmt: skip
+    views = best_views(seen, found)
+    assert (views["L0"].frame, views["L1"].frame) == (1, 2)
+    assert views["L0"].value == pytest.approx(0.5 * 40)
+    read: list[int] = []
+
+    def image(k: int) -> np.ndarray:
+        read.append(k)
+        return np.full((48, 64, 3), 10 * k, dtype=np.uint8)
+
+    write_crops(tmp_path / "crops", {**views, "L2": views["L1"]}, image)
+    assert read == [1, 2]  # each image once
+    assert sorted(path.name for path in (tmp_path / "crops").iterdir()) == ["L0.png", "L1.png", "L2.png"]
+    assert int(np.asarray(Image.open(tmp_path / "crops" / "L0.png")).mean()) == 10
+    write_crops(tmp_path / "none", {}, image)
+    assert list((tmp_path / "none").iterdir()) == []
+
+
+def test_a_crop_shows_the_box_with_a_margin() -> None:
+    image = np.zeros((100, 200, 3), dtype=np.uint8)
+    image[40:60, 80:120] = 255
+    part = cut(image, np.array([80.0, 40.0, 120.0, 60.0]))
+    assert part.shape == (LONGEST // 2, LONGEST, 3)  # 40 x 20 px with 15 % on each side, enlarged
+    assert (part[48, 96] == 255).all() and (part[2, 2] == 0).all()
+    assert cut(image, np.array([80.0, 40.0, 100.0, 60.0])).shape == (4 * 26, 4 * 26, 3)  # no more than four times
+    assert max(cut(image, np.array([-5.0, -5.0, 205.0, 105.0])).shape) == LONGEST
+    assert min(cut(image, np.array([199.9, 99.9, 200.0, 100.0])).shape) >= 1

@@ -1,0 +1,99 @@
+"""What a run is made from: poses by row and by time, lengths, pictures that belong to images, depth on the way."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nolbo_ppl.data.sequences import open_frames
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.odometry import GroundHeight, KnownLengths
+from nolbo_ppl.pipeline.depth_refinement import DepthScale
+from nolbo_ppl.pipeline.perception import DepthPictures, SequenceDepth, StereoPairs, beside, observed_rows
+from nolbo_ppl.pipeline.run_config import RunConfig
+from nolbo_ppl.pipeline.run_inputs import lengths_between, open_drive, scale_of
+from tests.simulated_sequence import CAMERA, SimulatedDrive
+
+
+def test_where_lengths_come_from(drive: SimulatedDrive, tmp_path: Path) -> None:
+    folder = drive.folder
+    (tmp_path / "wheel.txt").write_text("\n".join(str(0.5 + 0.01 * k) for k in range(119)) + "\n")
+    (tmp_path / "short.txt").write_text("1.0\n")
+
+    def scale(**change: Any) -> Any:
+        values: dict[str, Any] = {"images": folder / "images", "intrinsics": folder / "intrinsics.json", "out": tmp_path / "run",
+                                  "every": 3, **change}  # fmt: skip
+        config = RunConfig(**values)
+        return scale_of(open_drive(config), config)
+
+    by_wheel = scale(wheel=tmp_path / "wheel.txt", truth=folder / "truth.txt")
+    assert isinstance(by_wheel, KnownLengths)
+    np.testing.assert_allclose(by_wheel.lengths[:2], [3 * 0.51, 3 * 0.54])  # three steps each
+    by_truth = scale(truth=folder / "truth.txt")
+    position = drive.truth[::3, :3, 3]
+    np.testing.assert_allclose(by_truth.lengths, np.linalg.norm(np.diff(position, axis=0), axis=1), atol=1e-9)
+    assert scale(camera_height=1.6, camera_pitch=0.1) == GroundHeight(1.6, pitch=0.1)
+    with pytest.raises(InputError, match="lengths of steps: got 1 numbers, expected 119"):
+        scale(wheel=tmp_path / "short.txt")
+
+
+def test_lengths_of_steps_that_are_left_out_add_up() -> None:
+    np.testing.assert_allclose(lengths_between(np.array([1.0, 2.0, 4.0, 8.0]), np.array([0, 1, 3, 4])), [1.0, 6.0, 8.0])
+
+
+def test_pictures_beside_the_images(tmp_path: Path) -> None:
+    for name in ("000003.png", "000001.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    images = [f"../images/{k:06d}.jpg" for k in (1, 2, 3)]
+    assert beside(tmp_path, images, [1, 2, 3]) == [tmp_path / "000001.png", None, tmp_path / "000003.png"]
+    # No name fits: by number.
+    assert beside(tmp_path, ["a.png", "b.png"], [0, 1]) == [tmp_path / "000001.png", tmp_path / "000003.png"]
+    with pytest.raises(InputError, match="pictures that belong to no image: got 2 files"):
+        beside(tmp_path, ["a.png"], [2])
+    with pytest.raises(InputError, match="no such folder"):
+        beside(tmp_path / "none", ["a.png"], [0])
+
+
+def test_depth_sharpens_what_is_written(drive: SimulatedDrive, tmp_path: Path) -> None:
+    """Depth pictures of a wall as far as one of the objects: those near it are moved and told more sharply, others stay."""
+    frames = open_frames(drive.folder / "images")
+    table = drive.model.table
+    busiest = np.argsort(-np.bincount(table.frame), kind="stable")[:3].tolist()
+    names = [f"{k:06d}.png" for k in busiest]
+    nearest = float(table.position[np.isin(table.frame, busiest), 2].min())
+    for name in names:
+        Image.fromarray(np.full((96, 192), round(5000 * nearest), dtype=np.uint16)).save(tmp_path / name)
+
+    def rows(depth: Any) -> list[dict[str, Any]]:
+        read = [frames.frame(k) for k in busiest].__getitem__
+        observe = partial(drive.model.observe, threshold=0.05, batch=2, decode=False)
+        return list(observed_rows(observe, read, names, CAMERA, depth, 2))
+
+    plain = rows(SequenceDepth(frames, busiest))  # plain images bring no depth
+    sharp = rows(DepthPictures([tmp_path / name for name in names], DepthScale(unit=1 / 5000)))
+    assert [row["id"] for row in plain] == [row["id"] for row in sharp]
+    moved = 0
+    for before, after in zip(plain, sharp):
+        if before["position"] == after["position"]:
+            assert before["position_cov"] == after["position_cov"]
+            continue
+        moved += 1
+        assert np.trace(after["position_cov"]) < np.trace(before["position_cov"])
+        turned = np.linalg.norm(np.cross(before["position"], after["position"])) / np.dot(after["position"], after["position"])
+        assert turned < 0.02  # along the ray, but for what correlates with it
+    assert 0 < moved < len(plain)
+    known = rows(DepthPictures([None, None, None], DepthScale()))
+    assert known == plain
+
+
+def test_stereo_pairs_match_left_and_right() -> None:
+    rng = np.random.default_rng(0)
+    texture = np.kron(rng.integers(0, 256, (24, 60, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+    source = StereoPairs(lambda k: texture[:, 12:212], 100.0, 0.3)
+    depth = source.depth(0, texture[:, :200])
+    assert depth is not None and np.nanmedian(depth[10:-10, 40:-10]) == pytest.approx(100.0 * 0.3 / 12, rel=0.02)
