@@ -45,9 +45,18 @@ SHARES = {"shapes": 0.25, "single": 0.02, "scenes": 0.73}
 PROBE_STEPS = 12
 """Steps behind the measured cost of a step; the first third warms up."""
 FIGURES = (
-    "ap50", "map50", "category_accuracy", "acc_pi6", "med_err_deg", "azimuth_log_score", "voxel_iou_gain",
-    "retrieval_recall1", "ece_class", "coverage90_orientation", "coverage90_latent",
-)  # fmt: skip
+    "ap50",
+    "map50",
+    "category_accuracy",
+    "acc_pi6",
+    "med_err_deg",
+    "azimuth_log_score",
+    "voxel_iou_gain",
+    "retrieval_recall1",
+    "ece_class",
+    "coverage90_orientation",
+    "coverage90_latent",
+)
 """Columns of the table."""
 
 
@@ -75,14 +84,15 @@ VARIANTS = {
     "default": Variant("default", "inclusive objective, every stage, mixture of azimuths, 16 dimensions, second look"),
     "elbo": Variant("objective", "the pure bound", {"objective": "elbo"}),
     "elbo-light-voxels": Variant("objective", "the bound, voxels at 0.003", {"objective": "elbo", "weights": {"voxels": 0.003}}),
-    "paper": Variant("objective", "the bound, objectness turned, voxels at 0.003",
-                     {"objective": "paper", "weights": {"voxels": 0.003}}),
-    "no-shapes": Variant("shape pretraining", "none: shapes learnt with everything else",
-                         {"shape_steps": 0, "freeze": 0.0, "weights": OWN_SHAPES}),
+    "paper": Variant(
+        "objective", "the bound, objectness turned, voxels at 0.003", {"objective": "paper", "weights": {"voxels": 0.003}}
+    ),
+    "no-shapes": Variant(
+        "shape pretraining", "none: shapes learnt with everything else", {"shape_steps": 0, "freeze": 0.0, "weights": OWN_SHAPES}
+    ),
     "no-single": Variant("single objects", "no stage of single objects", {"single_steps": 0}),
     "no-label-term": Variant("auxiliary terms", "no term of the category head", {"weights": {"label_inclusive": 0.0}}),
-    "equal-weights": Variant("auxiliary terms", "every inclusive term at weight 1",
-                             {"weights": dict.fromkeys(INCLUSIVE, 1.0)}),
+    "equal-weights": Variant("auxiliary terms", "every inclusive term at weight 1", {"weights": dict.fromkeys(INCLUSIVE, 1.0)}),
     "size-96": Variant("image size", "96 px", networks={"image_size": 96}),
     "size-192": Variant("image size", "192 px", networks={"image_size": 192}),
     "angle": Variant("orientation", "one wrapped normal an angle", {"orientation": "angle"}),
@@ -90,11 +100,14 @@ VARIANTS = {
     "latent-128": Variant("latent", "128 dimensions", {"latent_dim": 128}),
     "adamw": Variant("optimiser", "AdamW throughout", {"optimizer": "adamw"}),
     "no-glimpse": Variant("second look", "none", networks={"glimpse": 0}),
-    "deep-glimpse": Variant("second look", "three maps, a residual block, details",
-                            networks={"glimpse_maps": 3, "glimpse_blocks": 1, "glimpse_detail": True}),
+    "deep-glimpse": Variant(
+        "second look",
+        "three maps, a residual block, details",
+        networks={"glimpse_maps": 3, "glimpse_blocks": 1, "glimpse_detail": True},
+    ),
     "category-prior": Variant("prior", "named instances, category prior only", folder=True),
     "instance-prior": Variant("prior", "named instances, category and instance prior", {"instance_labels": True}, folder=True),
-}  # fmt: skip
+}
 """All variants by name."""
 
 
@@ -156,12 +169,22 @@ def training_config(name: str, settings: Settings) -> AblationConfig:
     variant = VARIANTS[name]
     shapes, single, scenes = settings.steps
     config = AblationConfig(
-        out=settings.out / name / "run", preset=settings.preset, difficulty=settings.difficulty, count=settings.count,
-        single_count=settings.single_count, cache=settings.cache, seed=settings.seed, shape_steps=shapes,
-        single_steps=single, scene_steps=scenes, batch=settings.batch, threads=settings.threads, workers=settings.workers,
+        out=settings.out / name / "run",
+        preset=settings.preset,
+        difficulty=settings.difficulty,
+        count=settings.count,
+        single_count=settings.single_count,
+        cache=settings.cache,
+        seed=settings.seed,
+        shape_steps=shapes,
+        single_steps=single,
+        scene_steps=scenes,
+        batch=settings.batch,
+        threads=settings.threads,
+        workers=settings.workers,
         networks={"image_size": settings.image_size, **variant.networks},
         scenes=named_instances(settings) if variant.folder else None,
-    )  # fmt: skip
+    )
     return replace(config, **variant.training)
 
 
@@ -212,11 +235,16 @@ def planned(name: str, settings: Settings) -> tuple[AblationConfig, dict[str, An
     plan = read_json(file)
     if plan["seconds"] != settings.seconds:
         raise input_error(
-            "another budget than before", got=settings.seconds, expected=plan["seconds"], file=file,
+            "another budget than before",
+            got=settings.seconds,
+            expected=plan["seconds"],
+            file=file,
             do="choose another --out",
-        )  # fmt: skip
-    steps = {f"{'shape' if key == 'shapes' else 'single' if key == 'single' else 'scene'}_steps": value
-             for key, value in plan["steps"].items()}  # fmt: skip
+        )
+    steps = {
+        f"{'shape' if key == 'shapes' else 'single' if key == 'single' else 'scene'}_steps": value
+        for key, value in plan["steps"].items()
+    }
     return replace(config, **steps), plan
 
 
@@ -230,19 +258,27 @@ def measured(name: str, settings: Settings) -> dict[str, Any]:
     summary = run(config)
     size = rendered_size(config.model().image_size)
     evaluation = EvaluateConfig(
-        out=settings.out / name / "figures", model=str(summary.out), count=settings.evaluated,
-        difficulty=settings.difficulty, retrieval=settings.gallery > 0, gallery=max(settings.gallery, 2),
-        least_side=12.0 * size / 128, pictures=False,
-    )  # fmt: skip
+        out=settings.out / name / "figures",
+        model=str(summary.out),
+        count=settings.evaluated,
+        difficulty=settings.difficulty,
+        retrieval=settings.gallery > 0,
+        gallery=max(settings.gallery, 2),
+        least_side=12.0 * size / 128,
+        pictures=False,
+    )
     trained = time.process_time() - start
     evaluate.run(evaluation)
     values = read_json(evaluation.out / "metrics.json")
     result = {
-        "variant": name, "question": VARIANTS[name].question, "words": VARIANTS[name].words, **plan,
+        "variant": name,
+        "question": VARIANTS[name].question,
+        "words": VARIANTS[name].words,
+        **plan,
         "cpu_seconds_of_this_run": round(trained, 1),
         "figures": {figure: values.get(figure) for figure in FIGURES},
         "intervals": {figure: values["intervals"].get(figure) for figure in FIGURES},
-    }  # fmt: skip
+    }
     write_json(file, result)
     return result
 
@@ -275,10 +311,14 @@ def main(settings: Settings) -> None:
         measured(name, settings)
         done = [read_json(file) for key in VARIANTS if (file := settings.out / key / "result.json").is_file()]
         about = {"nolbo_ppl": __version__, "torch": torch.__version__, "machine": platform.machine()}
-        write_json(settings.out / "results.json", {
-            "settings": {key: str(value) if isinstance(value, Path) else value for key, value in asdict(settings).items()},
-            "versions": about, "results": done,
-        })  # fmt: skip
+        write_json(
+            settings.out / "results.json",
+            {
+                "settings": {key: str(value) if isinstance(value, Path) else value for key, value in asdict(settings).items()},
+                "versions": about,
+                "results": done,
+            },
+        )
         with atomic_path(settings.out / "table.md") as temporary:
             temporary.write_text(markdown(done), encoding="utf-8")
         print(markdown(done[-1:] if len(done) == 1 else [r for r in done if r["variant"] == name]))

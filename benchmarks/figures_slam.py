@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from nolbo_ppl.data.converters import Converted, convert_kitti_poles, convert_kitti_tracking, convert_ycbv_slam
-from nolbo_ppl.data.simulate import DetectorConfig, Drive, WorldConfig, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_drive
 from nolbo_ppl.geometry.pose import inverse, relative, rotation_angle, se3_log
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online, solve_with_associations
 from nolbo_ppl.io.files import read_json, write_json
@@ -27,10 +27,18 @@ from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align
 
 KINDS = ("distinct", "identical", "tracking", "ycb", "poles", "online")
 LEAST = {
-    ("distinct", "after/oracle"): 1.5, ("distinct", "precision"): 0.99, ("distinct", "recall"): 0.90,
-    ("distinct", "nees_pose"): 1.4, ("distinct", "nees_landmark"): 1.4, ("identical", "after"): 8.0,
-    ("poles", "after/oracle"): 1.5, ("tracking", "after/oracle"): 1.5, ("tracking", "f1"): 0.90,
-    ("ycb", "after/before"): 1.1, ("ycb", "object_right"): 0.6, ("online", "from_batch"): 0.2,
+    ("distinct", "after/oracle"): 1.5,
+    ("distinct", "precision"): 0.99,
+    ("distinct", "recall"): 0.90,
+    ("distinct", "nees_pose"): 1.4,
+    ("distinct", "nees_landmark"): 1.4,
+    ("identical", "after"): 8.0,
+    ("poles", "after/oracle"): 1.5,
+    ("tracking", "after/oracle"): 1.5,
+    ("tracking", "f1"): 0.90,
+    ("ycb", "after/before"): 1.1,
+    ("ycb", "object_right"): 0.6,
+    ("online", "from_batch"): 0.2,
 }
 """What is asked for at least (median of YCB's after/before: 0.85; after/before of every run: 1.1)."""
 MORE_IS_BETTER = ("precision", "recall", "f1", "object_right", "object_right_aligned", "objects")
@@ -82,14 +90,20 @@ def majority(truth: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
     return out
 
 
-def make_drive(arguments: Arguments, kind: str, seed: int) -> tuple[Drive, SlamConfig]:
+def make_drive(arguments: Arguments, kind: str, seed: int) -> tuple[SimulatedSequence, SlamConfig]:
     """KITTI 00 with simulated objects, odometry noise giving about 20 to 45 m."""
     path = arguments.data / "kitti_odometry" / "poses" / "00.txt"
     truth = read_trajectory(path).T_world_camera[:: arguments.every]
     world = WorldConfig(categories=3, instance_scale=0.0) if kind == "identical" else WorldConfig()
     rotation = 0.008 * np.sqrt(arguments.every / 5)
-    drive = simulate_drive(truth, np.random.default_rng(seed), world=world, odometry_rotation_scale=rotation,
-                           odometry_translation_ratio=0.01, detector=DetectorConfig(maximum_range=30.0))
+    drive = simulate_drive(
+        truth,
+        np.random.default_rng(seed),
+        world=world,
+        odometry_rotation_scale=rotation,
+        odometry_translation_ratio=0.01,
+        detector=DetectorConfig(maximum_range=30.0),
+    )
     return drive, SlamConfig(odometry_rotation_scale=rotation, odometry_translation_ratio=0.01)
 
 
@@ -146,8 +160,12 @@ def converted(name: str, data: Converted, gap: int) -> tuple[SlamResult, Row]:
     loops = association_pairs(frame[labelled], objects[labelled], label[labelled], gap)
     pairs = association_pairs(frame[static], objects[static], label[static])
     row = errors(problem.odometry, result.T_world_camera, oracle.estimate.T_world_camera, data.truth.T_world_camera, data.trusted)
-    return result, row | {"precision": loops.precision, "recall": loops.recall, "f1": pairs.f1,
-                          "seconds": sum(result.seconds.values())}
+    return result, row | {
+        "precision": loops.precision,
+        "recall": loops.recall,
+        "f1": pairs.f1,
+        "seconds": sum(result.seconds.values()),
+    }
 
 
 def objects_right(result: SlamResult, data: Converted) -> Row:
@@ -198,8 +216,11 @@ def drive(arguments: Arguments, kind: str, folder: Path, sequence: str, seed: in
 def jobs(arguments: Arguments, kind: str) -> Iterator[tuple[str, Callable[[], Row]]]:
     """Names of the runs of a scenario, and what computes them; seeds one after the other over all sequences."""
     folders = {"tracking": arguments.data / "kitti_tracking", "poles": arguments.data / "kitti_odometry"}
-    every_sequence = {"poles": ("00", "02", "08"), "tracking": ("0001", "0009"),
-                      "ycb": tuple(sorted(p.stem for p in (arguments.data / "ycbv_slam").glob("*.npz")))}
+    every_sequence = {
+        "poles": ("00", "02", "08"),
+        "tracking": ("0001", "0009"),
+        "ycb": tuple(sorted(p.stem for p in (arguments.data / "ycbv_slam").glob("*.npz"))),
+    }
     for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
         if kind in ("distinct", "identical"):
             yield f"{kind} {seed}", partial(simulated, arguments, kind, seed)

@@ -24,15 +24,33 @@ from nolbo_ppl.synthetic.worlds import drive_preset, write_drive
 UNSEEN = 91_000
 """Worlds are numbered from here: neither training nor the demonstration uses them."""
 FIGURES = (
-    ("before", "ate"), ("after", "ate"), ("oracle", "ate"), ("after_over_before",), ("after_over_oracle",),
-    ("loops", "precision"), ("loops", "recall"), ("map", "landmarks"), ("map", "objects_detected"), ("map", "objects_mapped"),
-    ("map", "duplicates"), ("map", "spurious"), ("map", "median_position_error"), ("observation_figures", "recall"),
-    ("observation_figures", "precision"), ("observation_figures", "category_accuracy"),
-    ("observation_figures", "position_error", "all", "median"), ("observation_figures", "position_error", "all", "p90"),
-    ("observation_figures", "coverage90", "position"), ("observation_figures", "coverage90", "orientation"),
-    ("observation_figures", "coverage90", "latent"), ("shape", "iou", "1"), ("shape", "iou", "3"), ("shape", "iou", "10"),
-    ("images_per_second",), ("share_of_em",),
-)  # fmt: skip
+    ("before", "ate"),
+    ("after", "ate"),
+    ("oracle", "ate"),
+    ("after_over_before",),
+    ("after_over_oracle",),
+    ("loops", "precision"),
+    ("loops", "recall"),
+    ("map", "landmarks"),
+    ("map", "objects_detected"),
+    ("map", "objects_mapped"),
+    ("map", "duplicates"),
+    ("map", "spurious"),
+    ("map", "median_position_error"),
+    ("observation_figures", "recall"),
+    ("observation_figures", "precision"),
+    ("observation_figures", "category_accuracy"),
+    ("observation_figures", "position_error", "all", "median"),
+    ("observation_figures", "position_error", "all", "p90"),
+    ("observation_figures", "coverage90", "position"),
+    ("observation_figures", "coverage90", "orientation"),
+    ("observation_figures", "coverage90", "latent"),
+    ("shape", "iou", "1"),
+    ("shape", "iou", "3"),
+    ("shape", "iou", "10"),
+    ("images_per_second",),
+    ("share_of_em",),
+)
 """Where the figures stand in `summary.json`."""
 
 
@@ -73,19 +91,23 @@ def run_one(arguments: Arguments, world: Literal["street", "indoor"], seed: int)
     height = config.camera_height if arguments.ground else None
     return run_mission(
         RunConfig(
-            images=drive / "images", intrinsics=drive / "intrinsics.json", truth=drive / "truth.txt", truth_objects=drive,
-            out=drive.parent / "run", model=arguments.model, online=arguments.online, camera_height=height,
+            images=drive / "images",
+            intrinsics=drive / "intrinsics.json",
+            truth=drive / "truth.txt",
+            truth_objects=drive,
+            out=drive.parent / "run",
+            model=arguments.model,
+            online=arguments.online,
+            camera_height=height,
             camera_pitch=math.radians(config.tilt),
         )
-    )  # fmt: skip
+    )
 
 
 def main() -> None:
     """Run everything, print the table."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    summaries = {
-        f"{world}-{seed}": run_one(arguments, world, seed) for world in arguments.worlds for seed in arguments.seeds
-    }
+    summaries = {f"{world}-{seed}": run_one(arguments, world, seed) for world in arguments.worlds for seed in arguments.seeds}
     write_json(arguments.out / "figures.json", summaries)
     names = ["/".join(path) for path in FIGURES]
     width = max(map(len, names))

@@ -43,7 +43,7 @@ from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.synthetic.scenes.scene_config import preset
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 from nolbo_ppl.training.scene_supply import to_batch
-from nolbo_ppl.training.stages import Stage, StageRun
+from nolbo_ppl.training.stages import StageRun, TrainingStage
 
 STEP_LIMIT, OBSERVE_LIMIT, WAITING_LIMIT = 1.10, 1.30, 0.05
 """What the figures may be at most."""
@@ -105,9 +105,7 @@ def hand_loss(model: Nolbo, batch: SceneBatch) -> Tensor:
     seen = batch.has_viewpoint[assigned]
     viewpoint, order = batch.viewpoint[assigned][seen], batch.symmetry[assigned][seen]
     truth = WrappedNormal(viewpoint[:, 0], torch.full_like(viewpoint[:, 0], config.orientation_scale))
-    mixture = VonMisesMixture(
-        q.azimuth_logits[seen], q.azimuth_natural[seen], max_concentration=config.max_concentration
-    )
+    mixture = VonMisesMixture(q.azimuth_logits[seen], q.azimuth_natural[seen], max_concentration=config.max_concentration)
     azimuth = kl_wrapped_to_mixture(truth, mixture, order).sum()
     tilt_scale = torch.full_like(viewpoint[:, 1:], config.orientation_scale)
     tilt = kl_of_angles(viewpoint[:, 1:], tilt_scale, q.angle_loc[seen], q.angle_scale[seen]).sum()
@@ -119,9 +117,7 @@ def hand_loss(model: Nolbo, batch: SceneBatch) -> Tensor:
 
     box = conjugate(where.box_target[assigned], config.box_scale, q.box_loc, q.box_scale)
     ranged = where.has_range[assigned]
-    range_ = conjugate(
-        where.range_target[assigned][ranged], config.range_scale, q.range_loc[ranged], q.range_scale[ranged]
-    )
+    range_ = conjugate(where.range_target[assigned][ranged], config.range_scale, q.range_loc[ranged], q.range_scale[ranged])
     total = (
         INCLUSIVE["objectness_inclusive"] * objectness.sum()
         + INCLUSIVE["label_inclusive"] * label
@@ -195,8 +191,8 @@ def assert_same_step(batch: SceneBatch) -> None:
         assert error < 1e-7, f"gradient of {name} differs by {error}"
 
 
-def _stage(steps: int = 10**6) -> Stage:
-    return Stage("scenes", OptimisationConfig(steps=steps, warmup=1, decay=0.0), INCLUSIVE, freeze=steps)
+def _stage(steps: int = 10**6) -> TrainingStage:
+    return TrainingStage("scenes", OptimisationConfig(steps=steps, warmup=1, decay=0.0), INCLUSIVE, freeze=steps)
 
 
 def compare(name: str, ours: Callable[[], Any], bare: Callable[[], Any], pairs: int, limit: float) -> Ratio:
@@ -277,10 +273,18 @@ def waiting_share(settings: Settings) -> float:
     """Share of a real training run's stages that is spent waiting for data."""
     with tempfile.TemporaryDirectory() as folder:
         config = TrainConfig(
-            out=Path(folder) / "run", count=2048, shape_steps=4, single_steps=0, scene_steps=settings.train_steps,
-            batch=settings.batch, cache=settings.cache, evaluate_every=10**6, evaluate_scenes=64, workers=1,
+            out=Path(folder) / "run",
+            count=2048,
+            shape_steps=4,
+            single_steps=0,
+            scene_steps=settings.train_steps,
+            batch=settings.batch,
+            cache=settings.cache,
+            evaluate_every=10**6,
+            evaluate_scenes=64,
+            workers=1,
             threads=torch.get_num_threads(),
-        )  # fmt: skip
+        )
         return run(config).waiting
 
 
@@ -309,10 +313,16 @@ def main(settings: Settings) -> None:
         print(f"{'share of training waiting for data':<34}{waiting:>32.4f}{WAITING_LIMIT:>24.2f}")
     if settings.out is not None:
         figures = {
-            "ratios": [asdict(r) for r in ratios], "objects_an_image": objects, "waiting": waiting,
-            "waiting_limit": WAITING_LIMIT, "pairs": settings.pairs, "batch": settings.batch,
-            "threads": torch.get_num_threads(), "torch": torch.__version__, "machine": platform.machine(),
-        }  # fmt: skip
+            "ratios": [asdict(r) for r in ratios],
+            "objects_an_image": objects,
+            "waiting": waiting,
+            "waiting_limit": WAITING_LIMIT,
+            "pairs": settings.pairs,
+            "batch": settings.batch,
+            "threads": torch.get_num_threads(),
+            "torch": torch.__version__,
+            "machine": platform.machine(),
+        }
         write_json(settings.out, figures)
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nolbo_ppl.data.simulate import DetectorConfig, Drive, simulate_drive
-from nolbo_ppl.inference.slam import ObjectSlam, SlamConfig, SlamProblem, solve, solve_with_associations
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, simulate_drive
+from nolbo_ppl.inference.slam import IncrementalSlam, SlamConfig, SlamProblem, solve, solve_with_associations
 from nolbo_ppl.io.trajectories import read_trajectory
 
 
@@ -34,19 +34,29 @@ class Arguments:
     """Seed of the world."""
 
 
-def make_drive(data: Path, every: int, seed: int, frames: int | None = None) -> tuple[Drive, SlamConfig]:
+def make_drive(data: Path, every: int, seed: int, frames: int | None = None) -> tuple[SimulatedSequence, SlamConfig]:
     """KITTI 00 with 400 objects of 20 categories, cut to its first frames; noise per metre does not depend on `every`."""
     truth = read_trajectory(data / "kitti_odometry" / "poses" / "00.txt").T_world_camera[::every]
     rotation = 0.008 * np.sqrt(every / 5)
-    drive = simulate_drive(truth, np.random.default_rng(seed), odometry_rotation_scale=rotation,
-                           odometry_translation_ratio=0.01, detector=DetectorConfig(maximum_range=30.0))
+    drive = simulate_drive(
+        truth,
+        np.random.default_rng(seed),
+        odometry_rotation_scale=rotation,
+        odometry_translation_ratio=0.01,
+        detector=DetectorConfig(maximum_range=30.0),
+    )
     early = drive.observations.frame < (frames or len(truth))
-    drive = replace(drive, truth=drive.truth[:frames], odometry=drive.odometry[:frames], object_of=drive.object_of[early],
-                    observations=drive.observations.select(early))
+    drive = replace(
+        drive,
+        truth=drive.truth[:frames],
+        odometry=drive.odometry[:frames],
+        object_of=drive.object_of[early],
+        observations=drive.observations.select(early),
+    )
     return drive, SlamConfig(odometry_rotation_scale=rotation, odometry_translation_ratio=0.01)
 
 
-def time_batch(drive: Drive, config: SlamConfig) -> dict[str, float]:
+def time_batch(drive: SimulatedSequence, config: SlamConfig) -> dict[str, float]:
     """Batch EM and plain LM with true associations."""
     problem = SlamProblem(drive.odometry, drive.observations)
     start = time.process_time()
@@ -54,15 +64,20 @@ def time_batch(drive: Drive, config: SlamConfig) -> dict[str, float]:
     middle = time.process_time()
     solve_with_associations(problem, drive.object_of, config, result.state.noise)
     end = time.process_time()
-    return {"keyframes": len(problem), "observations": len(problem.observations), "em": middle - start,
-            "oracle": end - middle, "ratio": (middle - start) / (end - middle)}
+    return {
+        "keyframes": len(problem),
+        "observations": len(problem.observations),
+        "em": middle - start,
+        "oracle": end - middle,
+        "ratio": (middle - start) / (end - middle),
+    }
 
 
-def time_online(drive: Drive, config: SlamConfig) -> dict[str, float]:
+def time_online(drive: SimulatedSequence, config: SlamConfig) -> dict[str, float]:
     """Latency of each update in ms."""
     table = drive.observations
     first = table.select(table.frame < 100)
-    slam = ObjectSlam(config, calibration=SlamProblem(drive.odometry[:100], first))
+    slam = IncrementalSlam(config, calibration=SlamProblem(drive.odometry[:100], first))
     latency = []
     for t, pose in enumerate(drive.odometry):
         rows = table.select(table.frame == t)
@@ -70,8 +85,13 @@ def time_online(drive: Drive, config: SlamConfig) -> dict[str, float]:
         slam.update(pose, rows)
         latency.append(1e3 * (time.process_time() - start))
     x = np.array(latency[1:])  # the first update calibrates
-    return {"mean": float(x.mean()), "p99": float(np.percentile(x, 99)), "first_500": float(x[:500].mean()),
-            "last_500": float(x[-500:].mean()), "last_over_first": float(x[-500:].mean() / x[:500].mean())}
+    return {
+        "mean": float(x.mean()),
+        "p99": float(np.percentile(x, 99)),
+        "first_500": float(x[:500].mean()),
+        "last_500": float(x[-500:].mean()),
+        "last_over_first": float(x[-500:].mean() / x[:500].mean()),
+    }
 
 
 def main() -> None:
@@ -86,9 +106,7 @@ def main() -> None:
         report["batch_1000"], report["batch_4541"] = part, whole
         report["growth_over_linear"] = whole["em"] / part["em"] / (whole["keyframes"] / part["keyframes"])
     if arguments.online:
-        report["online"] = time_online(
-            *(make_drive(arguments.data, 1, arguments.seed) if arguments.large else (drive, config))
-        )
+        report["online"] = time_online(*(make_drive(arguments.data, 1, arguments.seed) if arguments.large else (drive, config)))
     print(json.dumps(report, indent=2))
 
 

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from nolbo_ppl.citations import citation as citation
     from nolbo_ppl.inference.posterior.model_folder import load as load
     from nolbo_ppl.inference.posterior.predictor import ObservationModel as ObservationModel
-    from nolbo_ppl.structures.object_posteriors import Observations as Observations
+    from nolbo_ppl.structures.object_posteriors import ObjectPosteriors as ObjectPosteriors
 
 from nolbo_ppl import _moved
 from nolbo_ppl._version import __version__
@@ -18,14 +18,16 @@ _moved.install()
 _LAZY = {
     "load": "nolbo_ppl.inference.posterior.model_folder",
     "ObservationModel": "nolbo_ppl.inference.posterior.predictor",
-    "Observations": "nolbo_ppl.structures.object_posteriors",
+    "ObjectPosteriors": "nolbo_ppl.structures.object_posteriors",
     "citation": "nolbo_ppl.citations",
 }
-__all__ = ["ObservationModel", "Observations", "__version__", "citation", "load"]
+__all__ = ["ObservationModel", "ObjectPosteriors", "__version__", "citation", "load"]
 
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for when it is asked for, so that `import nolbo_ppl` stays light."""
+    if name == "Observations":
+        return _moved.renamed("nolbo_ppl", {name: "ObjectPosteriors"})(name)
     if name not in _LAZY:
         raise AttributeError(f"module 'nolbo_ppl' has no attribute {name!r}")
     import importlib

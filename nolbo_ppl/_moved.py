@@ -9,7 +9,7 @@ import importlib
 import importlib.util
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.abc import InspectLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import CodeType, ModuleType
@@ -227,9 +227,7 @@ class _MovedLoader(Loader):
 class _MovedFinder(MetaPathFinder):
     """Finds modules by the names that they had in version 0.1.0."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """A specification that loads the new module, with a `FutureWarning`; None for names that did not move."""
         package, _, name = fullname.partition(".")
         if package != "nolbo_ppl" or name not in MOVED:
@@ -261,5 +259,18 @@ def moved_names(package: str, module: str) -> Callable[[str], Any]:
             raise AttributeError(f"module {package!r} has no attribute {name!r}") from None
         warnings.warn(f"{package}.{name} moved to {module}; the old name goes with 0.3.0", FutureWarning, stacklevel=2)
         return value
+
+    return get
+
+
+def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+    """`__getattr__` of a module whose classes have other names than in 0.1.0: the old names still work, with a warning."""
+
+    def get(name: str) -> Any:
+        """The class under its new name."""
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warnings.warn(f"{module}.{name} is now {names[name]}; the old name goes with 0.3.0", FutureWarning, stacklevel=2)
+        return getattr(importlib.import_module(module), names[name])
 
     return get

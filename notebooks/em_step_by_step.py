@@ -25,8 +25,7 @@ import numpy as np
 
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.inference.association import association_marginals
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, init, plain_init, plain_solve, step
-from nolbo_ppl.inference.slam import map_refinement as finish
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, finish, init, plain_init, plain_solve, step
 from nolbo_ppl.inference.slam.reference_em import e_step
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
@@ -34,8 +33,11 @@ LAP = 80
 rng = np.random.default_rng(2)
 truth = simulate_circuit(rng, laps=2, radius=35.0, frames_per_lap=LAP)
 drive = simulate_drive(
-    truth, rng, world=WorldConfig(objects=40, categories=5, latent_dim=8, category_scale=2.0, lateral=(4.0, 9.0)),
-    detector=DetectorConfig(maximum_range=18.0, clutter_rate=0.4), odometry_rotation_scale=0.012,
+    truth,
+    rng,
+    world=WorldConfig(objects=40, categories=5, latent_dim=8, category_scale=2.0, lateral=(4.0, 9.0)),
+    detector=DetectorConfig(maximum_range=18.0, clutter_rate=0.4),
+    odometry_rotation_scale=0.012,
     odometry_translation_ratio=0.02,
 )
 problem, config, table = SlamProblem(drive.odometry, drive.observations), SlamConfig(), drive.observations
@@ -72,7 +74,7 @@ for own, colour, label in ((~second, OWN, "seen in the first lap"), (second, OBJ
     place = state.estimate.T_world_landmark[own, :3, 3]
     axis.scatter(place[:, 0], place[:, 2], s=16, color=colour, label=label)
 axis.set(aspect="equal", xlabel="x, m", ylabel="z, m", title=f"{len(second)} tracklets")
-axis.legend(frameon=False, fontsize=8);
+axis.legend(frameon=False, fontsize=8)
 
 # %% [markdown]
 # ## The literal EM
@@ -173,8 +175,7 @@ for axis, number in zip(axes, (0, 1, len(steps))):
     error = absolute_trajectory_error(now.estimate.T_world_camera, truth).rmse
     when = f"{number} step{'s' * (number > 1)}" if number else "init"
     axis.set(aspect="equal", title=f"after {when}: {error:.2f} m")
-axes[0].set(xlabel="x, m", ylabel="z, m");
-
+axes[0].set(xlabel="x, m", ylabel="z, m")
 # %% [markdown]
 # Its log evidence is reported for each iteration. This form is no coordinate ascent on the bound above: covariances change
 # between iterations, and are inflated in the first ones. Compare values within a phase only.
@@ -186,8 +187,7 @@ colours = [OWN if info.phase == "em" else "#f28e2b" for info in steps]
 axes[0].bar(number, [info.log_evidence for info in steps], color=colours)
 axes[0].set(title="log evidence, nats (orange: constellations)", xlabel="iteration")
 axes[1].semilogy(number, [max(info.change, 1e-4) for info in steps], "o-", color=OWN)
-axes[1].set(title="motion of the cameras, m", xlabel="iteration");
-
+axes[1].set(title="motion of the cameras, m", xlabel="iteration")
 # %% [markdown]
 # ## Weights after
 #
@@ -252,4 +252,4 @@ edges = np.linspace(0, 1, 21)
 for own, colour, label in ((drive.object_of >= 0, OWN, "objects"), (drive.object_of < 0, OBJECT, "nothing")):
     axis.hist(associations.background[own], edges, color=colour, alpha=0.7, label=label, log=True)
 axis.set(xlabel="probability of background", ylabel="detections")
-axis.legend(frameon=False);
+axis.legend(frameon=False)

@@ -50,15 +50,20 @@ categories, dimensions = model.config.categories, model.config.latent_dim
 
 # %%
 single = dataclasses.replace(
-    preset("standard", model.config.image_size), objects=(1, 1), empty_probability=0.0, object_pixels=(48.0, 0.8),
+    preset("standard", model.config.image_size),
+    objects=(1, 1),
+    empty_probability=0.0,
+    object_pixels=(48.0, 0.8),
     truncation_probability=0.0,
 )
 source = SceneSource(single, seed=88_003)
 scenes = [scene for scene in map(source.render, range(220)) if len(scene.labels) == 1]
 labels = np.array([categories.index(scene.labels[0].category) for scene in scenes])
 answers = model.observe_boxes(
-    [scene.image for scene in scenes], np.array([scene.intrinsics for scene in scenes]),
-    [scene.labels[0].box[None] for scene in scenes], decode=False,
+    [scene.image for scene in scenes],
+    np.array([scene.intrinsics for scene in scenes]),
+    [scene.labels[0].box[None] for scene in scenes],
+    decode=False,
 )
 guide = np.concatenate([answer.latent for answer in answers])
 
@@ -91,7 +96,11 @@ encoder = nn.Sequential(
     nn.Conv3d(1, 16, 4, 2, 1), nn.ELU(), nn.Conv3d(16, 32, 4, 2, 1), nn.ELU(), nn.Flatten(), nn.Linear(32 * 64, dimensions)
 )
 decoder = nn.Sequential(
-    nn.Linear(dimensions, 32 * 64), nn.ELU(), nn.Unflatten(1, (32, 4, 4, 4)), nn.ConvTranspose3d(32, 16, 4, 2, 1), nn.ELU(),
+    nn.Linear(dimensions, 32 * 64),
+    nn.ELU(),
+    nn.Unflatten(1, (32, 4, 4, 4)),
+    nn.ConvTranspose3d(32, 16, 4, 2, 1),
+    nn.ELU(),
     nn.ConvTranspose3d(16, 1, 4, 2, 1),
 )
 voxels, loss_at = coarse(items), []
@@ -152,8 +161,7 @@ for axis, (title, place, label) in zip(axes, maps):
 for axis in axes[1:]:
     low, high = shared.min(0) - 3, shared.max(0) + 3
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, markerscale=2);
-
+figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, markerscale=2)
 # %% [markdown]
 # The plain autoencoder groups what looks alike, since it sees the voxels; but its groups are ragged and lie anywhere.
 # A number for the picture is the silhouette over categories, 1 for far and tight groups, 0 for none, taken in all
@@ -207,8 +215,7 @@ for column, number in enumerate(chosen):
     draw_shape(figure, grid[0, column], occupancy[column], category_colour(categories[number]), viewpoint)
     draw_shape(figure, grid[1, column], anything[column], "#9aa3ab", viewpoint)
     figure.text((column + 0.5) / len(chosen), 0.94, categories[number], ha="center", fontsize=9)
-figure.text(0.5, 0.46, "plain autoencoder, drawn from one Gaussian about its latents", ha="center", fontsize=9);
-
+figure.text(0.5, 0.46, "plain autoencoder, drawn from one Gaussian about its latents", ha="center", fontsize=9)
 # %% [markdown]
 # ## Between two categories
 #

@@ -70,8 +70,7 @@ for p, panel in enumerate(axes[1:]):
     panel.imshow(scene.image, alpha=0.35, extent=(0, side, side, 0))
     shown = panel.imshow(objectness[..., p], vmin=0, vmax=1, cmap="magma", alpha=0.75, extent=(0, side, side, 0))
     panel.set_title(f"q(o = 1 | I), predictor {p}")
-figure.colorbar(shown, ax=axes[1:], shrink=0.85);
-
+figure.colorbar(shown, ax=axes[1:], shrink=0.85)
 # %% [markdown]
 # Regions above a threshold that survive non-maximum suppression are the detections. `observe` returns all their
 # posteriors; this is the library's own picture of them.
@@ -110,8 +109,7 @@ axis.bar(place + 0.2, normalised, 0.4, label="N(μ_q; μ_ψ(l), I), normalised",
 axis.set_xticks(place, objects.categories, rotation=40, ha="right")
 axis.get_xticklabels()[objects.categories.index(truth.category)].set_fontweight("bold")
 axis.set(ylabel="probability", ylim=(0, 1.02), title=f"category (truth in bold: {truth.category})")
-axis.legend(frameon=False);
-
+axis.legend(frameon=False)
 # %% [markdown]
 # ## Azimuth: a mixture of von Mises densities
 #
@@ -137,8 +135,7 @@ for weight, mean, concentration in zip(modes.weights[index], modes.azimuth[index
         line.axvline(np.degrees(mean), color=colour, lw=0.5 + 2 * weight, ls=":")
         print(f"mode of weight {weight:.3f} at {np.degrees(mean):6.1f}°, scale {np.degrees(concentration**-0.5):.1f}°")
 line.set(xlabel="azimuth, degrees", ylabel="density, 1/rad", ylim=(1e-4, None), title="log density")
-line.legend(frameon=False);
-
+line.legend(frameon=False)
 # %% [markdown]
 # ## Elevation and in-plane rotation: Normals
 
@@ -213,12 +210,18 @@ for category, row in zip(objects.categories, prior):
     axis.plot(dimension, row, color=colour if own else "#c9ced3", lw=2 if own else 0.7, zorder=2 if own else 1)
 axis.errorbar(dimension, latent, latent_scale, fmt="o", color=colour, capsize=2, label="q(z | I)", zorder=3)
 axis.errorbar(
-    dimension + 0.2, teacher[0], teacher_scale[0], fmt="s", color="black", ms=3, capsize=2,
-    label="q(z | true voxels)", zorder=3,
+    dimension + 0.2,
+    teacher[0],
+    teacher_scale[0],
+    fmt="s",
+    color="black",
+    ms=3,
+    capsize=2,
+    label="q(z | true voxels)",
+    zorder=3,
 )
 axis.set(xlabel="dimension", title=f"shape latent, and the prior mean of {objects.category[index]} (line)")
-axis.legend(frameon=False, ncols=2);
-
+axis.legend(frameon=False, ncols=2)
 # %% [markdown]
 # ## Voxels: mean and variance over the posterior
 #

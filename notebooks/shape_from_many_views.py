@@ -30,7 +30,7 @@ import nolbo_ppl
 from nolbo_ppl.geometry.voxels import unpack_voxels, voxel_iou
 from nolbo_ppl.inference.slam.detection_features import weighted_latents
 from nolbo_ppl.synthetic.assets.shape_library import ShapePool
-from nolbo_ppl.synthetic.renderer.camera_view import Placed, View
+from nolbo_ppl.synthetic.renderer.camera_view import MeshInstance, View
 from nolbo_ppl.synthetic.renderer.materials import sample_materials
 from nolbo_ppl.synthetic.scenes.environment import sample_backdrop, sample_light
 from nolbo_ppl.synthetic.scenes.render_scene import Scene, SceneObject, render_scene
@@ -64,10 +64,17 @@ def view_of(item, materials, azimuth, rng, size=config.size):
     light = np.random.default_rng(4)
     lights, sky, ground = sample_light(config, light, R_camera_world)
     view = View(
-        height=size, width=size, intrinsics=intrinsics, up=up, north=R_camera_world[:, 0],
+        height=size,
+        width=size,
+        intrinsics=intrinsics,
+        up=up,
+        north=R_camera_world[:, 0],
         camera_height=half_height - float(up @ centre),
-        placed=(Placed(item.mesh, R_camera_object, centre, materials, 0),), lights=lights, ambient_sky=sky,
-        ambient_ground=ground, backdrop=sample_backdrop(config, light, R_camera_world, None),
+        placed=(MeshInstance(item.mesh, R_camera_object, centre, materials, 0),),
+        lights=lights,
+        ambient_sky=sky,
+        ambient_ground=ground,
+        backdrop=sample_backdrop(config, light, R_camera_world, None),
     )
     thing = SceneObject(R_camera_object, centre, 1.0, item)
     return render_scene(Scene(view, (thing,), 1.0, 0.0, 0.005, int(rng.integers(2**31)), 1, 0.0, 1.0))
@@ -116,7 +123,7 @@ for n in range(VIEWS):
     )
 axis.plot(dimension, target[0], color="black", drawstyle="steps-mid", lw=1.2, label="of the true voxels")
 axis.set(xlabel="dimension of the latent", title="latent by view, mean ± scale (dark: first view, light: last)")
-axis.legend(frameon=False);
+axis.legend(frameon=False)
 
 # %% [markdown]
 # ## Fusing by precision
@@ -154,8 +161,7 @@ for n, colour in ((1, "#b8c4d6"), (3, "#6f8fc0"), (10, "#1f4e9c")):
     )
 axis.plot(dimension, target[0], color="black", drawstyle="steps-mid", lw=1.2, label="of the true voxels")
 axis.set(xlabel="dimension of the latent", title="fused latent")
-axis.legend(frameon=False, ncols=4);
-
+axis.legend(frameon=False, ncols=4)
 # %% [markdown]
 # ## Decoded, with uncertainty
 #
@@ -174,8 +180,7 @@ for column, n in enumerate((1, 3, 10)):
     iou = voxel_iou(occupancy > 0.5, true_voxels)
     figure.text(0.125 + 0.25 * column, 0.95, f"{n} view{'s' if n > 1 else ''}, IoU {float(iou):.2f}", ha="center")
 draw_shape(figure, grid[0, 3], true_voxels.astype(float), "#444444", viewpoint)
-figure.text(0.875, 0.95, "truth", ha="center");
-
+figure.text(0.875, 0.95, "truth", ha="center")
 # %% [markdown]
 # ## Over many objects
 #

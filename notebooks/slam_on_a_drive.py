@@ -74,8 +74,11 @@ else:
 
 rng = np.random.default_rng(9)
 drive = simulate_drive(
-    truth, rng, world=WorldConfig(objects=160, categories=8, instance_scale=0.8, lateral=(4.0, 10.0)),
-    detector=DetectorConfig(maximum_range=20.0, clutter_rate=0.3), odometry_rotation_scale=0.006,
+    truth,
+    rng,
+    world=WorldConfig(objects=160, categories=8, instance_scale=0.8, lateral=(4.0, 10.0)),
+    detector=DetectorConfig(maximum_range=20.0, clutter_rate=0.3),
+    odometry_rotation_scale=0.006,
     odometry_translation_ratio=0.02,
 )
 write_trajectory(folder / "odometry.txt", Trajectory(drive.odometry))
@@ -95,7 +98,9 @@ print({name: line[name] for name in ("frame", "position", "objectness", "categor
 # %%
 result, summary = run(
     SlamArguments(
-        odometry=folder / "odometry.txt", observations=folder / "observations.jsonl", truth=folder / "truth.txt",
+        odometry=folder / "odometry.txt",
+        observations=folder / "observations.jsonl",
+        truth=folder / "truth.txt",
         out=folder / "map",
     )
 )
@@ -121,8 +126,7 @@ for axis, T, colour, label in ((axes[0], align(drive.odometry, truth), VO, "odom
     axis.legend(frameon=False, fontsize=8)
 axes[1].scatter(*drive.world.position[:, [0, 2]].T, s=30, marker="+", color="#bbbbbb", lw=0.8)
 shown = axes[1].scatter(place[:, 0], place[:, 2], s=10, c=existence, cmap="viridis", vmin=0, vmax=1, zorder=3)
-figure.colorbar(shown, ax=axes[1], label="probability of existing (+: true objects)");
-
+figure.colorbar(shown, ax=axes[1], label="probability of existing (+: true objects)")
 # %% [markdown]
 # ## Error along the way
 #
@@ -138,8 +142,7 @@ axis.plot(before, color=VO, label="odometry")
 axis.plot(after, color=OWN, label="corrected")
 axis.plot(claim, color=OWN, ls=":", label="its standard deviation, from the first pose")
 axis.set(xlabel="keyframe", ylabel="m", ylim=(0, None))
-axis.legend(frameon=False, fontsize=8);
-
+axis.legend(frameon=False, fontsize=8)
 # %% [markdown]
 # ## Are the loops right?
 #
@@ -164,8 +167,7 @@ correct = (drive.object_of[a] == drive.object_of[b]) & (drive.object_of[a] >= 0)
 axis.scatter(frame[b][correct], frame[a][correct], s=2, color=OWN, label="right")
 axis.scatter(frame[b][~correct], frame[a][~correct], s=8, color=OBJECT, label="wrong")
 axis.set(xlabel="earlier keyframe", ylabel="later keyframe", title="loops", xlim=(0, len(truth)), ylim=(0, len(truth)))
-axis.legend(frameon=False, fontsize=8, markerscale=2);
-
+axis.legend(frameon=False, fontsize=8, markerscale=2)
 # %% [markdown]
 # ## Are the uncertainties right?
 #
@@ -185,8 +187,10 @@ error = np.array([(fixed @ result.landmarks[j].T_world_object)[:3, 3] for j in m
 error -= drive.world.position[object_of_landmark[matched]]
 covariance = np.array([fixed[:3, :3] @ result.landmarks[j].position_covariance @ fixed[:3, :3].T for j in matched])
 nees = normalised_error_squared(error, covariance)
-print(f"{len(matched)} of {len(result.landmarks)} landmarks are true objects; "
-      f"{len(set(object_of_landmark[matched].tolist()))} different ones, of {len(drive.world.position)}")
+print(
+    f"{len(matched)} of {len(result.landmarks)} landmarks are true objects; "
+    f"{len(set(object_of_landmark[matched].tolist()))} different ones, of {len(drive.world.position)}"
+)
 figure, axes = plt.subplots(1, 2, figsize=(9, 2.8), layout="constrained")
 axes[0].hist(np.clip(nees, 0, 5), 30, color=OWN)
 axes[0].axvline(1, color="black", lw=0.8)
@@ -194,8 +198,7 @@ axes[0].set(title=f"squared error over covariance, mean {nees.mean():.2f}", xlab
 size = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
 axes[1].plot(size, np.linalg.norm(error, axis=1), ".", color=OWN)
 axes[1].plot([0, size.max()], [0, size.max()], color="black", lw=0.8)
-axes[1].set(xlabel="claimed standard deviation, m", ylabel="actual error, m", title="landmarks");
-
+axes[1].set(xlabel="claimed standard deviation, m", ylabel="actual error, m", title="landmarks")
 # %% [markdown]
 # ## One landmark
 #
@@ -215,4 +218,4 @@ axis.errorbar(dimension, best.latent, np.sqrt(best.latent_variance), fmt="o", co
 if (j := object_of_landmark[best.index]) >= 0:
     axis.plot(dimension, drive.world.latent[j], color="black", drawstyle="steps-mid", lw=1, label="truth")
     axis.legend(frameon=False, fontsize=8)
-axis.set(xlabel="dimension", title="shape latent from all views");
+axis.set(xlabel="dimension", title="shape latent from all views")

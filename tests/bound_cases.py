@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nolbo_ppl.inference.elbo import INCLUSIVE, INCLUSIVE_TERMS, PURE_BOUND, SceneElbo
+from nolbo_ppl.inference.elbo import INCLUSIVE, INCLUSIVE_TERMS, PURE_BOUND, SceneELBO
 from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
@@ -16,7 +16,7 @@ EVERYTHING = {**PURE_BOUND, **dict.fromkeys(INCLUSIVE_TERMS.values(), 1.0), **di
 
 def terms_of(model: Nolbo, scene: ObservedScene, names: set[str] | None = None, **kwargs: object) -> dict[str, Tensor]:
     """Terms without gradients, as numbers."""
-    found = SceneElbo(EVERYTHING).terms(model.story, model.guide, scene, names=names, **kwargs)
+    found = SceneELBO(EVERYTHING).terms(model.story, model.guide, scene, names=names, **kwargs)
     return {name: value.detach() for name, value in found.items()}
 
 

@@ -49,17 +49,23 @@ def normalisation(rank: int | None) -> dict[str, Tensor]:
             distributed.all_reduce(parameter.grad)
     layer.eval()
     return {
-        "first": outputs[0], "second": outputs[1], "gradient": mine.grad, "evaluated": layer(mine).detach(),
-        "weight": layer.weight.grad, "bias": layer.bias.grad, "mean": layer.running_mean, "var": layer.running_var,
+        "first": outputs[0],
+        "second": outputs[1],
+        "gradient": mine.grad,
+        "evaluated": layer(mine).detach(),
+        "weight": layer.weight.grad,
+        "bias": layer.bias.grad,
+        "mean": layer.running_mean,
+        "var": layer.running_var,
         "steps": layer.num_batches_tracked,
-    }  # fmt: skip
+    }
 
 
 def training(rank: int | None) -> dict[str, Tensor]:
     """State after steps of shapes, then of scenes: frozen, then free and decoding."""
     from nolbo_ppl.inference.svi import OptimisationConfig
     from nolbo_ppl.models.shape_vae import ShapeBatch
-    from nolbo_ppl.training.stages import Stage, StageRun, scene_weights
+    from nolbo_ppl.training.stages import StageRun, TrainingStage, scene_weights
     from tests.factories import random_batch, tiny_config, tiny_model
 
     def scenes_of(step: int) -> SceneBatch:
@@ -77,13 +83,13 @@ def training(rank: int | None) -> dict[str, Tensor]:
 
     model = tiny_model(scatter=0.1)
     quick = OptimisationConfig(steps=2, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
-    shapes = StageRun(model, Stage("shapes", quick, {"shape_kl": 1.0, "voxels": 0.01}))
+    shapes = StageRun(model, TrainingStage("shapes", quick, {"shape_kl": 1.0, "voxels": 0.01}))
     for step in range(2):
         shapes.step(shapes_of(step))
     shapes.adopt_average()
     quick = OptimisationConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
     weights = scene_weights("inclusive", {"rotation": 0.01, "voxels": 0.01})
-    scenes = StageRun(model, Stage("scenes", quick, weights, freeze=1, decode=64))
+    scenes = StageRun(model, TrainingStage("scenes", quick, weights, freeze=1, decode=64))
     for step in range(3):
         scenes.step(scenes_of(step))
     state = {f"model/{name}": value for name, value in model.state_dict().items()}
@@ -93,11 +99,11 @@ def training(rank: int | None) -> dict[str, Tensor]:
 def local_run(seed: int) -> StageRun:
     """Scenes, three steps in all, averaged after every second one."""
     from nolbo_ppl.inference.svi import OptimisationConfig
-    from nolbo_ppl.training.stages import Stage, StageRun, scene_weights
+    from nolbo_ppl.training.stages import StageRun, TrainingStage, scene_weights
     from tests.factories import tiny_model
 
     quick = OptimisationConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
-    stage = Stage("scenes", quick, scene_weights("inclusive"), freeze=3)
+    stage = TrainingStage("scenes", quick, scene_weights("inclusive"), freeze=3)
     return StageRun(tiny_model(scatter=0.1, seed=seed), stage, average_every=2)
 
 
@@ -128,9 +134,7 @@ def main() -> None:
     task, rank, store, out = sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4]
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    distributed.init_process_group(
-        "gloo", init_method=f"file://{store}", rank=rank, world_size=2, timeout=timedelta(seconds=120)
-    )
+    distributed.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2, timeout=timedelta(seconds=120))
     tensors = TASKS[task](rank)
     save_file({name: value.detach().contiguous().clone() for name, value in tensors.items()}, out)
     distributed.destroy_process_group()

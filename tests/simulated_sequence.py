@@ -16,10 +16,10 @@ from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circui
 from nolbo_ppl.geometry.pose import inverse, make_pose, matrix_to_quaternion, transform
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import pack_voxels, voxel_centres
-from nolbo_ppl.io.observations import ObservationTable
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.models.posterior_calibration import Calibration
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 CAMERA = np.array([100.0, 100.0, 96.0, 48.0])
 SIZE = (192, 96)
@@ -46,18 +46,18 @@ def boxes_of(position: np.ndarray) -> np.ndarray:
 class KnowingModel:
     """Answers with the simulated detections of the frame that is written into an image's first pixel."""
 
-    table: ObservationTable
+    table: Detections
     latents: np.ndarray
     calls: int = 0
     calibration: Calibration = field(default_factory=Calibration)
 
-    def observe(self, images: Any, intrinsics: Any = None, **options: Any) -> list[Observations]:
+    def observe(self, images: Any, intrinsics: Any = None, **options: Any) -> list[ObjectPosteriors]:
         self.calls += 1
         assert options["decode"] is False and len(images) <= options["batch"]
         np.testing.assert_allclose(intrinsics, CAMERA)
         return [self.one(int(image[0, 0, 0]) * 256 + int(image[0, 0, 1]), options["threshold"]) for image in images]
 
-    def one(self, frame: int, threshold: float) -> Observations:
+    def one(self, frame: int, threshold: float) -> ObjectPosteriors:
         table = self.table
         rows = np.flatnonzero((table.frame == frame) & (table.objectness > threshold))
         n = len(rows)
@@ -67,19 +67,34 @@ class KnowingModel:
         label = np.array([CATEGORIES.index(str(table.category[k])) for k in rows], dtype=np.int64)
         log = np.log(np.where(np.arange(len(CATEGORIES)) == label[:, None], 0.9, 0.05)).reshape(n, len(CATEGORIES))
         scale = table.rotation_scale[rows]
-        return Observations(
-            categories=CATEGORIES, objectness=table.objectness[rows], box=boxes_of(table.position[rows]),
-            box_scale=np.ones((n, 4)), class_log_posterior=log, class_log_likelihood=log, instance_log_posterior=None,
-            latent=table.latent[rows], latent_scale=table.latent_scale[rows], position=table.position[rows],
+        return ObjectPosteriors(
+            categories=CATEGORIES,
+            objectness=table.objectness[rows],
+            box=boxes_of(table.position[rows]),
+            box_scale=np.ones((n, 4)),
+            class_log_posterior=log,
+            class_log_likelihood=log,
+            instance_log_posterior=None,
+            latent=table.latent[rows],
+            latent_scale=table.latent_scale[rows],
+            position=table.position[rows],
             position_covariance=table.position_covariance[rows],
             viewpoint_modes=ViewpointModes(
-                np.tile([0.9, 0.1], (n, 1)), viewpoint[:, :1] + [[0.0, np.pi]],
+                np.tile([0.9, 0.1], (n, 1)),
+                viewpoint[:, :1] + [[0.0, np.pi]],
                 np.repeat(1 / scale[:, None] ** 2, 2, axis=1),
             ),
-            elevation_inplane=viewpoint[:, 1:], elevation_inplane_scale=np.repeat(scale[:, None], 2, axis=1),
-            viewpoint=viewpoint, R_camera_object=R, rotation_scale=scale, diagonal=np.full(n, DIAGONAL),
-            diagonal_log_scale=np.full(n, 0.1), size=np.full((n, 3), DIAGONAL / 3**0.5), voxel_mean=None, voxel_variance=None,
-        )  # fmt: skip
+            elevation_inplane=viewpoint[:, 1:],
+            elevation_inplane_scale=np.repeat(scale[:, None], 2, axis=1),
+            viewpoint=viewpoint,
+            R_camera_object=R,
+            rotation_scale=scale,
+            diagonal=np.full(n, DIAGONAL),
+            diagonal_log_scale=np.full(n, 0.1),
+            size=np.full((n, 3), DIAGONAL / 3**0.5),
+            voxel_mean=None,
+            voxel_variance=None,
+        )
 
     def decode(self, latent: np.ndarray) -> np.ndarray:
         return ellipsoids(np.asarray(latent))
@@ -104,11 +119,19 @@ def frame_objects(position: np.ndarray, R: np.ndarray, seen: np.ndarray, categor
     """Objects of one line of scenes.jsonl."""
     box = boxes_of(position[seen]) if len(seen) else np.zeros((0, 4))
     return [
-        {"id": f"O{i}", "category": CATEGORIES[category[i]], "instance": f"shape-{i}", "box": box[k].tolist(),
-         "rotation": matrix_to_quaternion(R[i]).tolist(), "position": position[i].tolist(), "size": DIAGONAL,
-         "visibility": 1.0, "symmetry": 1}
+        {
+            "id": f"O{i}",
+            "category": CATEGORIES[category[i]],
+            "instance": f"shape-{i}",
+            "box": box[k].tolist(),
+            "rotation": matrix_to_quaternion(R[i]).tolist(),
+            "position": position[i].tolist(),
+            "size": DIAGONAL,
+            "visibility": 1.0,
+            "symmetry": 1,
+        }
         for k, i in enumerate(seen)
-    ]  # fmt: skip
+    ]
 
 
 @pytest.fixture(scope="session")
@@ -117,12 +140,14 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDrive:
     folder = tmp_path_factory.mktemp("drive")
     rng = np.random.default_rng(3)
     simulated = simulate_drive(
-        simulate_circuit(rng, laps=2, frames_per_lap=60, radius=15.0), rng,
+        simulate_circuit(rng, laps=2, frames_per_lap=60, radius=15.0),
+        rng,
         world=WorldConfig(objects=20, categories=3, latent_dim=4, lateral=(3.0, 7.0)),
-        detector=DetectorConfig(maximum_range=16.0, clutter_rate=0.1, flip_rate=0.0, latent_scale=0.6,
-                                position_scale=0.04, position_ratio=0.008),
+        detector=DetectorConfig(
+            maximum_range=16.0, clutter_rate=0.1, flip_rate=0.0, latent_scale=0.6, position_scale=0.04, position_ratio=0.008
+        ),
         odometry_rotation_scale=0.006,
-    )  # fmt: skip
+    )
     world, truth = simulated.world, simulated.truth
     assert world is not None
     (folder / "images").mkdir()
@@ -139,11 +164,18 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDrive:
         lines.append({"image": f"images/{t:06d}.png", "intrinsics": CAMERA.tolist(), "objects": objects})
     (folder / "scenes.jsonl").write_text("\n".join(json.dumps(line) for line in lines) + "\n")
     things = [
-        {"id": f"O{i}", "category": CATEGORIES[world.category[i]], "instance": f"shape-{i}", "symmetry": 1, "diagonal": DIAGONAL,
-         "T_world_object": make_pose(world.rotation[i], world.position[i]).tolist(), "dimensions": [0.8, 0.8, 0.8],
-         "moving": False}
+        {
+            "id": f"O{i}",
+            "category": CATEGORIES[world.category[i]],
+            "instance": f"shape-{i}",
+            "symmetry": 1,
+            "diagonal": DIAGONAL,
+            "T_world_object": make_pose(world.rotation[i], world.position[i]).tolist(),
+            "dimensions": [0.8, 0.8, 0.8],
+            "moving": False,
+        }
         for i in range(len(world.position))
-    ]  # fmt: skip
+    ]
     (folder / "objects.json").write_text(json.dumps(things))
     packed = pack_voxels(ellipsoids(world.latent) > 0.5)
     np.savez_compressed(folder / "voxels.npz", **{f"shape-{i}": row for i, row in enumerate(packed)})

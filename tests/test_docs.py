@@ -41,7 +41,7 @@ def commands(page: Path) -> list[str]:
             line = re.sub(r"^(\w+=\S+ )*(\.venv/bin/)?", "", line)
             if line.startswith("nolbo "):
                 found.append(line)
-            elif "-m nolbo_ppl." in line and "..." not in line:  # torchrun ... -m nolbo_ppl.cli.train OPTIONS
+            elif "-m nolbo_ppl." in line and "..." not in line:  # torchrun ... -m nolbo_ppl.train OPTIONS
                 found.append("nolbo " + line.split("-m nolbo_ppl.", 1)[1])
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     found += [line for line in INLINE.findall(text) if " --" in line and "..." not in line and "[" not in line]
@@ -197,8 +197,12 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     import os
 
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")], cwd=ROOT,
-        env={**os.environ, "NOLBO_DOCS_EXECUTE": "0", "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, timeout=600,
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        env={**os.environ, "NOLBO_DOCS_EXECUTE": "0", "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     reference = (tmp_path / "site/reference/inference_slam/index.html").read_text(encoding="utf-8")

@@ -127,6 +127,23 @@ def test_names_of_a_module_that_became_a_room_are_found() -> None:
         _ = importlib.import_module("nolbo_ppl.io").nothing
 
 
+@pytest.mark.parametrize(
+    ("module", "old", "new"),
+    [
+        ("nolbo_ppl", "Observations", "ObjectPosteriors"),
+        ("nolbo_ppl.io.observations", "ObservationTable", "Detections"),
+        ("nolbo_ppl.models.generative", "Story", "GenerativeModel"),
+        ("nolbo_ppl.inference.elbo", "SceneElbo", "SceneELBO"),
+        ("nolbo_ppl.inference.slam", "ObjectSlam", "IncrementalSlam"),
+    ],
+)
+def test_class_names_of_the_first_version_warn_and_work(module: str, old: str, new: str) -> None:
+    home = importlib.import_module(module)
+    with pytest.warns(FutureWarning, match=f"{old} is now {new}"):
+        assert getattr(home, old) is getattr(home, new)
+    assert not hasattr(home, "Nothing")
+
+
 def test_importing_the_package_is_light() -> None:
     heavy = {"torch", "pyro", "matplotlib", "gtsam", "numpy"}
     program = f"import sys, nolbo_ppl, nolbo_ppl.cli; print(sorted(set(sys.modules) & {heavy}))"

@@ -19,7 +19,11 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[2]
 ORDER = (
-    "posterior_of_a_scene", "latent_space", "shape_from_many_views", "em_step_by_step", "slam_on_a_drive",
+    "posterior_of_a_scene",
+    "latent_space",
+    "shape_from_many_views",
+    "em_step_by_step",
+    "slam_on_a_drive",
 )
 """Tutorials in the order of the navigation; others follow by name."""
 HIDDEN = re.compile(r"^(# *)?%.*\n?", re.MULTILINE)

@@ -65,9 +65,17 @@ class KittiPoles:
     def convert(self) -> Converted:
         """Run it."""
         return convert_kitti_poles(
-            self.data, self.sequence, odometry=self.odometry, every=self.every, seed=self.seed,
-            position_scale=self.position_scale, position_ratio=self.position_ratio, miss_rate=self.miss_rate,
-            clutter_rate=self.clutter_rate, maximum_range=self.maximum_range)
+            self.data,
+            self.sequence,
+            odometry=self.odometry,
+            every=self.every,
+            seed=self.seed,
+            position_scale=self.position_scale,
+            position_ratio=self.position_ratio,
+            miss_rate=self.miss_rate,
+            clutter_rate=self.clutter_rate,
+            maximum_range=self.maximum_range,
+        )
 
 
 @dataclass(frozen=True)
@@ -91,8 +99,14 @@ class KittiTracking:
 
     def convert(self) -> Converted:
         """Run it."""
-        return convert_kitti_tracking(self.data, self.sequence, seed=self.seed, rotation_drift=self.rotation_drift,
-                                      translation_drift=self.translation_drift, minimum_score=self.minimum_score)
+        return convert_kitti_tracking(
+            self.data,
+            self.sequence,
+            seed=self.seed,
+            rotation_drift=self.rotation_drift,
+            translation_drift=self.translation_drift,
+            minimum_score=self.minimum_score,
+        )
 
 
 @dataclass(frozen=True)
@@ -118,8 +132,15 @@ class YcbvSlam:
 
     def convert(self) -> Converted:
         """Run it."""
-        return convert_ycbv_slam(self.data, self.sequence, detections=self.detections, every=self.every, seed=self.seed,
-                                 rotation_drift=self.rotation_drift, translation_drift=self.translation_drift)
+        return convert_ycbv_slam(
+            self.data,
+            self.sequence,
+            detections=self.detections,
+            every=self.every,
+            seed=self.seed,
+            rotation_drift=self.rotation_drift,
+            translation_drift=self.translation_drift,
+        )
 
 
 Source = (

@@ -23,10 +23,10 @@ from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords, concat
 from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
 from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, figures
 from nolbo_ppl.inference.posterior.model_folder import load
-from nolbo_ppl.inference.posterior.multiscale import Pyramid
+from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.files import write_json
-from nolbo_ppl.metrics.intervals import Estimate
+from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
@@ -101,9 +101,11 @@ def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSourc
 
         cad = tuple(load_cad_folder(config.cad, model_config.categories))
     return SceneSource(
-        preset(config.difficulty, rendered_size(model_config.image_size)), seed=config.seed, cad=cad,
+        preset(config.difficulty, rendered_size(model_config.image_size)),
+        seed=config.seed,
+        cad=cad,
         backgrounds=None if config.backgrounds is None else str(config.backgrounds),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -112,14 +114,14 @@ class Evaluation:
 
     objects: ObjectRecords
     detections: DetectionRecords
-    figures: dict[str, Estimate]
+    figures: dict[str, IntervalEstimate]
     scenes: int
     categories: tuple[str, ...]
     retrieval: RetrievalRecords | None = None
     """Instances found again, where that was asked for."""
 
 
-def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: Scenes) -> Evaluation:
+def measure(config: EvaluateConfig, model: ObservationModel | MultiScalePredictor, scenes: Scenes) -> Evaluation:
     """Run the model over the scenes and compute every figure.
 
     Raises:
@@ -142,15 +144,19 @@ def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: S
         if used:
             slots = [np.flatnonzero(counted[k]) for k in used]
             at_boxes = model.observe_boxes(
-                [images[k] for k in used], cameras[used], [truth[k].box[s] for k, s in zip(used, slots)],
-                decode=False, batch=config.batch,
-            )  # fmt: skip
+                [images[k] for k in used],
+                cameras[used],
+                [truth[k].box[s] for k, s in zip(used, slots)],
+                decode=False,
+                batch=config.batch,
+            )
             objects.append(measure_objects([truth[k] for k in used], at_boxes, slots, [rows[k] for k in used], model))
     if not objects:
         raise input_error(
-            "no object to evaluate on", got=f"{len(scenes)} scenes",
+            "no object to evaluate on",
+            got=f"{len(scenes)} scenes",
             expected=f"a box with a side of {config.least_side} px, {config.least_visibility:.0%} of it seen",
-        )  # fmt: skip
+        )
     categories = model.config.categories
     records = concatenate(objects)
     detections = measure_detections(boxes, labels, counts, answers, len(categories), regions=regions)
@@ -160,7 +166,7 @@ def measure(config: EvaluateConfig, model: ObservationModel | Pyramid, scenes: S
 
 
 def measure_retrieval(
-    config: EvaluateConfig, model: ObservationModel | Pyramid, views: InstanceViews
+    config: EvaluateConfig, model: ObservationModel | MultiScalePredictor, views: InstanceViews
 ) -> RetrievalRecords:
     """Render two views of every instance, take the shape latent at the true box, and seek each among the others.
 
@@ -176,9 +182,12 @@ def measure_retrieval(
         pairs = [views.pair(*instance) for instance in instances[start : start + step]]
         flat = [view for pair in pairs for view in pair]
         answers = model.observe_boxes(
-            [view.image for view in flat], np.array([view.intrinsics for view in flat]), [view.box for view in flat],
-            decode=False, batch=config.batch,
-        )  # fmt: skip
+            [view.image for view in flat],
+            np.array([view.intrinsics for view in flat]),
+            [view.box for view in flat],
+            decode=False,
+            batch=config.batch,
+        )
         means.append(np.array([answer.latent[0] for answer in answers]).reshape(len(pairs), 2, -1))
         scales.append(np.array([answer.latent_scale[0] for answer in answers]).reshape(len(pairs), 2, -1))
     category = np.array([views.categories.index(name) for name, _ in instances])
@@ -203,10 +212,12 @@ def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
         "configuration": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()},
         "seeds": {"scenes": config.seed if config.scenes is None else None, "bootstrap": config.seed},
         "versions": {
-            "nolbo_ppl": __version__, "python": platform.python_version(), "torch": torch.__version__,
+            "nolbo_ppl": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
             "numpy": np.__version__,
         },
-    }  # fmt: skip
+    }
 
 
 def table(evaluation: Evaluation) -> str:
@@ -229,7 +240,7 @@ def _number(value: float | None) -> str:
 def run(config: EvaluateConfig) -> Evaluation:
     """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`."""
     loaded = load(config.model)
-    model = Pyramid(loaded, config.sizes) if config.sizes else loaded
+    model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
     scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
     if config.retrieval:
@@ -246,7 +257,7 @@ def run(config: EvaluateConfig) -> Evaluation:
 
 
 def _draw(
-    evaluation: Evaluation, values: dict[str, Any], scenes: Scenes, model: ObservationModel | Pyramid, out: Path
+    evaluation: Evaluation, values: dict[str, Any], scenes: Scenes, model: ObservationModel | MultiScalePredictor, out: Path
 ) -> None:
     """Plots, examples, and the page that shows them with every figure."""
     from nolbo_ppl.viz.detection_plots import write_detections

@@ -15,7 +15,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
 from nolbo_ppl.io.files import atomic_path, write_jsonl
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 """Files of these names are images."""
@@ -108,9 +108,7 @@ def _rows(config: ObserveConfig, paths: list[Path], model: ObservationModel) -> 
             bar.update(len(part))
 
 
-def _draw(
-    config: ObserveConfig, path: Path, image: np.ndarray, observations: Observations, model: ObservationModel
-) -> None:
+def _draw(config: ObserveConfig, path: Path, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:
     """The posterior over the image, as `OUT/NAME.png`."""
     from nolbo_ppl.viz.posterior_plots import draw_observations  # matplotlib is only needed for pictures
 

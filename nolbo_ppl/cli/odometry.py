@@ -77,8 +77,11 @@ def part_of(frames: FrameSequence, first: int, count: int | None) -> Part:
     """The frames asked for. Raises `InputError` when they are not there."""
     rest = len(frames) - first
     if first < 0 or rest < 1 or (count is not None and not 1 <= count <= rest):
-        raise input_error("frames asked for", got=f"{count if count is not None else 'all'} from {first}",
-                          expected=f"frames within 0 to {len(frames) - 1}")
+        raise input_error(
+            "frames asked for",
+            got=f"{count if count is not None else 'all'} from {first}",
+            expected=f"frames within 0 to {len(frames) - 1}",
+        )
     return Part(frames, first, rest if count is None else count)
 
 
@@ -105,8 +108,12 @@ def known_lengths(path: Path, part: Part) -> np.ndarray:
         return lengths
     if len(lengths) == len(part.frames) - 1:
         return lengths[part.first : part.first + len(part) - 1]
-    raise input_error("lengths do not match the frames", got=f"{len(lengths)} lengths",
-                      expected=f"{len(part.frames) - 1}, one fewer than frames", file=path)
+    raise input_error(
+        "lengths do not match the frames",
+        got=f"{len(lengths)} lengths",
+        expected=f"{len(part.frames) - 1}, one fewer than frames",
+        file=path,
+    )
 
 
 def scale_of(arguments: OdometryArguments, part: Part, truth: np.ndarray | None) -> Scale:
@@ -128,9 +135,12 @@ def summary(odometry: Odometry, truth: np.ndarray | None, seconds: float) -> dic
     """Figures of a run: counts, speed, and errors where the truth is known."""
     names = {flag.name: int(np.sum((odometry.flags & flag) > 0)) for flag in StepFlag if flag}
     figures: dict[str, Any] = {
-        "frames": len(odometry), "path_length": path_length(odometry.T_world_camera),
+        "frames": len(odometry),
+        "path_length": path_length(odometry.T_world_camera),
         "median_inliers": float(np.median(odometry.inliers)) if len(odometry) > 1 else 0.0,
-        "flags": names, "seconds": round(seconds, 3), "frames_per_second": round(len(odometry) / max(seconds, 1e-9), 2),
+        "flags": names,
+        "seconds": round(seconds, 3),
+        "frames_per_second": round(len(odometry) / max(seconds, 1e-9), 2),
     }
     if truth is not None and len(odometry) > 1:
         error = absolute_trajectory_error(odometry.T_world_camera, truth, "se3").rmse
@@ -144,8 +154,9 @@ def write_odometry(out: Path, odometry: Odometry, times: np.ndarray | None, repo
     out.mkdir(parents=True, exist_ok=True)
     write_trajectory(out / "odometry.txt", Trajectory(odometry.T_world_camera))
     with atomic_path(out / COVARIANCE) as temporary:
-        np.savez(temporary, covariance=odometry.covariance, matches=odometry.matches, inliers=odometry.inliers,
-                 flags=odometry.flags)
+        np.savez(
+            temporary, covariance=odometry.covariance, matches=odometry.matches, inliers=odometry.inliers, flags=odometry.flags
+        )
     if times is not None:
         with atomic_path(out / "times.txt") as temporary:
             temporary.write_text("".join(f"{stamp!r}\n" for stamp in times.tolist()), encoding="utf-8")
@@ -165,8 +176,9 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
     begin = time.perf_counter()
     odometry = estimate_odometry(part, intrinsics, scale, arguments.config, progress=True)
     figures = summary(odometry, truth, time.perf_counter() - begin)
-    options = {name: str(value) if isinstance(value, Path) else value
-               for name, value in asdict(arguments).items() if name != "config"}
+    options = {
+        name: str(value) if isinstance(value, Path) else value for name, value in asdict(arguments).items() if name != "config"
+    }
     report = {"version": __version__, "options": options, "config": asdict(arguments.config), **figures}
     write_odometry(arguments.out, odometry, frame_times(part), report)
     return odometry, report
@@ -175,8 +187,10 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
 def describe(report: dict[str, Any]) -> str:
     """A few lines for the terminal."""
     flags = {name: count for name, count in report["flags"].items() if count}
-    lines = [f"{report['frames']} frames, {report['path_length']:.1f} m, {report['frames_per_second']:.1f} frames/s, "
-             f"{report['median_inliers']:.0f} inliers"]
+    lines = [
+        f"{report['frames']} frames, {report['path_length']:.1f} m, {report['frames_per_second']:.1f} frames/s, "
+        f"{report['median_inliers']:.0f} inliers"
+    ]
     if flags:
         lines.append("guessed steps: " + json.dumps(flags))
     if "ate" in report:

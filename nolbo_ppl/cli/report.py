@@ -37,9 +37,13 @@ def run(arguments: ReportArguments) -> Path:
         InputError: no result in the folder, or a file that is malformed or does not match.
     """
     return write_report(
-        arguments.run_dir, odometry=arguments.odometry, observations=arguments.observations, truth=arguments.truth,
-        out=arguments.out, title=arguments.title,
-    )  # fmt: skip
+        arguments.run_dir,
+        odometry=arguments.odometry,
+        observations=arguments.observations,
+        truth=arguments.truth,
+        out=arguments.out,
+        title=arguments.title,
+    )
 
 
 def main(args: Sequence[str] | None = None) -> None:

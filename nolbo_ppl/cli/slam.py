@@ -63,14 +63,17 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
         result = solve(problem, arguments.config)
     from nolbo_ppl.viz.map_plots import draw_slam_result
 
+    report = write_result(arguments.out, result, odometry, truth, model=model)
     draw_slam_result(arguments.out / "map.png", odometry.T_world_camera, result, truth)
-    return result, write_result(arguments.out, result, odometry, truth, model=model)
+    return result, report
 
 
 def describe(report: dict[str, object]) -> str:
     """A few lines for the terminal."""
-    lines = [f"{report['frames']} frames, {report['observations']} observations, {report['landmarks']} landmarks, "
-             f"{report['loop_pairs']} loop pairs"]
+    lines = [
+        f"{report['frames']} frames, {report['observations']} observations, {report['landmarks']} landmarks, "
+        f"{report['loop_pairs']} loop pairs"
+    ]
     before, after = report.get("before"), report.get("after")
     if isinstance(before, dict) and isinstance(after, dict):
         lines.append(f"ATE {before['ate']:.3f} m -> {after['ate']:.3f} m")

@@ -101,9 +101,7 @@ def _draw(config: Augmentation, seeds: Int[np.ndarray, " b"]) -> _Draws:
     return _Draws(zoom, shift, colour, offset, blur, noise)
 
 
-def augment(
-    batch: SceneBatch, config: Augmentation | None, seeds: Int[np.ndarray, " b"], size: int | None = None
-) -> SceneBatch:
+def augment(batch: SceneBatch, config: Augmentation | None, seeds: Int[np.ndarray, " b"], size: int | None = None) -> SceneBatch:
     """An augmented batch; images come back as floats in 0..255.
 
     Args:

@@ -129,9 +129,11 @@ class SceneFolder:
         for name, bits in voxels.items():
             if bits.dtype != np.uint8 or bits.shape != (VOXELS**3 // 8,):
                 raise input_error(
-                    f"voxels of {name}", got=f"{bits.dtype} {bits.shape}",
-                    expected=f"uint8 [{VOXELS**3 // 8}]: {VOXELS}^3 packed bits", file=file,
-                )  # fmt: skip
+                    f"voxels of {name}",
+                    got=f"{bits.dtype} {bits.shape}",
+                    expected=f"uint8 [{VOXELS**3 // 8}]: {VOXELS}^3 packed bits",
+                    file=file,
+                )
         return voxels
 
     def _placing(self, row: int) -> tuple[float, float, float]:

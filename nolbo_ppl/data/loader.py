@@ -38,7 +38,8 @@ def batch_indices(total: int, batch_size: int, seed: int, step: int) -> Int[np.n
     """
     if total < 1 or batch_size < 1 or step < 0:
         raise input_error(
-            "no batch of scenes", got=f"{total} scenes, batch size {batch_size}, step {step}",
+            "no batch of scenes",
+            got=f"{total} scenes, batch size {batch_size}, step {step}",
             expected="at least one scene, a batch of at least one, a step of at least 0",
         )
     first = step * batch_size

@@ -89,9 +89,7 @@ def _write_shard(source: Source, folder: Path, shard: int, slots: int) -> int:
     return BLOCK
 
 
-def write_cache(
-    cache: str | os.PathLike[str], source: Source, count: int, workers: int = 1, slots: int = SLOTS
-) -> CachedScenes:
+def write_cache(cache: str | os.PathLike[str], source: Source, count: int, workers: int = 1, slots: int = SLOTS) -> CachedScenes:
     """Render what is missing of the first `count` scenes (whole shards of 1024) into a cache and open it.
 
     Args:
@@ -137,7 +135,9 @@ class CachedScenes:
         count = available if count is None else count
         if not shards or count > available or count < 1:
             raise input_error(
-                "not enough scenes in the cache", got=f"{available} scenes in {self.folder}", expected=count,
+                "not enough scenes in the cache",
+                got=f"{available} scenes in {self.folder}",
+                expected=count,
                 do="call write_cache to render the missing ones",
             )
         self.count = count

@@ -1,5 +1,4 @@
-"""Simulated object SLAM on any true trajectory: a world of objects along the way, noisy detections, drifting odometry.
-"""
+"""Simulated object SLAM on any true trajectory: a world of objects along the way, noisy detections, drifting odometry."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
-from nolbo_ppl.io.observations import ObservationTable, make_table
+from nolbo_ppl.io.observations import Detections, make_table
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class DetectorConfig:
 
 
 @dataclass(frozen=True)
-class World:
+class SimulatedWorld:
     """Static objects in the frame of the trajectory."""
 
     position: Float[np.ndarray, "m 3"]
@@ -77,18 +76,18 @@ class World:
 
 
 @dataclass(frozen=True)
-class Drive:
+class SimulatedSequence:
     """A simulated drive with its truth."""
 
     truth: Float[np.ndarray, "n 4 4"]
     """True T_world_camera."""
     odometry: Float[np.ndarray, "n 4 4"]
     """Drifting T_world_camera."""
-    observations: ObservationTable
+    observations: Detections
     """Detections."""
     object_of: Int[np.ndarray, " k"]
     """True object of each detection, -1 for clutter."""
-    world: World | None = None
+    world: SimulatedWorld | None = None
     """The objects, where they are known."""
 
 
@@ -96,9 +95,7 @@ class Drive:
 R_WORLD_UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def simulate_world(
-    truth: Float[np.ndarray, "n 4 4"], config: WorldConfig, rng: np.random.Generator
-) -> World:
+def simulate_world(truth: Float[np.ndarray, "n 4 4"], config: WorldConfig, rng: np.random.Generator) -> SimulatedWorld:
     """Scatter objects to both sides of a path, upright with any heading, at the height of the camera less 1 m."""
     positions: list[np.ndarray] = []
     tries = 0
@@ -120,7 +117,7 @@ def simulate_world(
     yaw = rng.uniform(-np.pi, np.pi, m)
     rotation = R_WORLD_UPRIGHT @ so3_exp(yaw[:, None] * np.array([0.0, 0.0, 1.0]))
     latent = means[category] + config.instance_scale * rng.standard_normal((m, config.latent_dim))
-    return World(np.array(positions).reshape(m, 3), rotation, category, latent, means)
+    return SimulatedWorld(np.array(positions).reshape(m, 3), rotation, category, latent, means)
 
 
 def simulate_odometry(
@@ -151,8 +148,8 @@ def simulate_odometry(
 
 
 def simulate_detections(
-    truth: Float[np.ndarray, "n 4 4"], world: World, config: DetectorConfig, rng: np.random.Generator
-) -> tuple[ObservationTable, Int[np.ndarray, " k"]]:
+    truth: Float[np.ndarray, "n 4 4"], world: SimulatedWorld, config: DetectorConfig, rng: np.random.Generator
+) -> tuple[Detections, Int[np.ndarray, " k"]]:
     """Detections of every frame in order, and the true object of each (-1 clutter).
 
     Noise of a position is isotropic with scale `position_scale + position_ratio * range`. Latents of clutter are drawn
@@ -170,9 +167,7 @@ def simulate_detections(
         clutter = int(rng.poisson(config.clutter_rate))
         depth = rng.uniform(config.minimum_range, config.maximum_range, clutter)
         angle = rng.uniform(-0.5, 0.5, clutter) * config.field_of_view
-        false = np.stack(
-            [depth * np.sin(angle), 1.0 + 0.3 * rng.standard_normal(clutter), depth * np.cos(angle)], axis=1
-        )
+        false = np.stack([depth * np.sin(angle), 1.0 + 0.3 * rng.standard_normal(clutter), depth * np.cos(angle)], axis=1)
         frames.append(np.full(len(rows) + clutter, t))
         points.append(np.concatenate([local[rows], false]))
         sources.append(np.concatenate([rows, np.full(clutter, -1)]))
@@ -200,25 +195,34 @@ def simulate_detections(
     mean = np.where(true, config.objectness[0], config.objectness[1])
     objectness = rng.beta(10 * mean, 10 * (1 - mean)) if n else np.zeros(0)
     table = make_table(
-        frame, position, position_scale=scale, rotation=rotation, rotation_scale=config.rotation_scale, latent=latent,
-        latent_scale=config.latent_scale if latent is not None else None, objectness=objectness, category=category,
+        frame,
+        position,
+        position_scale=scale,
+        rotation=rotation,
+        rotation_scale=config.rotation_scale,
+        latent=latent,
+        latent_scale=config.latent_scale if latent is not None else None,
+        objectness=objectness,
+        category=category,
         id=[f"{t:06d}-{k:06d}" for k, t in enumerate(frame)],
     )
     return table, source
 
 
 def simulate_drive(
-    truth: Float[np.ndarray, "n 4 4"], rng: np.random.Generator, *, world: WorldConfig | None = None,
-    detector: DetectorConfig | None = None, odometry_rotation_scale: float = 0.004,
+    truth: Float[np.ndarray, "n 4 4"],
+    rng: np.random.Generator,
+    *,
+    world: WorldConfig | None = None,
+    detector: DetectorConfig | None = None,
+    odometry_rotation_scale: float = 0.004,
     odometry_translation_ratio: float = 0.01,
-) -> Drive:
+) -> SimulatedSequence:
     """World, odometry and detections on a true trajectory, all from one generator."""
     objects = simulate_world(truth, world or WorldConfig(), rng)
-    odometry = simulate_odometry(
-        truth, rng, rotation_scale=odometry_rotation_scale, translation_ratio=odometry_translation_ratio
-    )
+    odometry = simulate_odometry(truth, rng, rotation_scale=odometry_rotation_scale, translation_ratio=odometry_translation_ratio)
     table, source = simulate_detections(truth, objects, detector or DetectorConfig(), rng)
-    return Drive(truth=truth, odometry=odometry, observations=table, object_of=source, world=objects)
+    return SimulatedSequence(truth=truth, odometry=odometry, observations=table, object_of=source, world=objects)
 
 
 def simulate_circuit(

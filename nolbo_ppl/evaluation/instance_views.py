@@ -29,9 +29,15 @@ LEAST_VISIBILITY = 0.7
 def view_config(config: SceneConfig) -> SceneConfig:
     """The same look with one whole object of some size and nothing before it."""
     return replace(
-        config, objects=(1, 1), empty_probability=0.0, clutter=(0, 0), truncation_probability=0.0, near_probability=0.0,
-        object_pixels=(LEAST_PIXELS * config.size, 0.9), least_visibility=LEAST_VISIBILITY,
-    )  # fmt: skip
+        config,
+        objects=(1, 1),
+        empty_probability=0.0,
+        clutter=(0, 0),
+        truncation_probability=0.0,
+        near_probability=0.0,
+        object_pixels=(LEAST_PIXELS * config.size, 0.9),
+        least_visibility=LEAST_VISIBILITY,
+    )
 
 
 def render_view(source: SceneSource, category: str, number: int, view: int) -> Rendered:
@@ -71,7 +77,5 @@ class InstanceViews:
 
     def pair(self, category: str, number: int) -> tuple[SceneTruth, SceneTruth]:
         """The two views of an instance."""
-        first, second = (
-            truth_of_rendered(render_view(self.source, category, number, view), self.categories) for view in (0, 1)
-        )
+        first, second = (truth_of_rendered(render_view(self.source, category, number, view), self.categories) for view in (0, 1))
         return first, second

@@ -85,9 +85,9 @@ class FolderScenes:
             R_camera_object=np.array(
                 [unknown_rotation if thing.R_camera_object is None else thing.R_camera_object for thing in objects]
             ).reshape(n, 3, 3),
-            position=np.array(
-                [unknown_position if thing.position is None else thing.position for thing in objects]
-            ).reshape(n, 3),
+            position=np.array([unknown_position if thing.position is None else thing.position for thing in objects]).reshape(
+                n, 3
+            ),
             symmetry=np.array([thing.symmetry for thing in objects], dtype=np.int64),
             visibility=np.array([thing.visibility for thing in objects], dtype=np.float64),
             voxels=arrays["voxels"][0, :n],

@@ -1,4 +1,4 @@
-"""What a model answers beside what is true: the step from `Observations` to the records of `metrics.figures`.
+"""What a model answers beside what is true: the step from `ObjectPosteriors` to the records of `metrics.figures`.
 
 Detection is measured on everything the model finds; category, viewpoint, position and shape at the true boxes, on the
 region responsible for each ("with ground truth bounding box", NOLBO Table 1).
@@ -23,7 +23,7 @@ from nolbo_ppl.metrics.detection import Matches, match
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_average_precision, voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 CRPS_NODES = 360
 """Nodes on the circle of the ranked probability score: one a degree."""
@@ -72,9 +72,7 @@ class ShapeModel(Protocol):
     def decode(self, latent: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n v v v"]:
         """Occupancy probabilities of latents."""
 
-    def shape_posterior(
-        self, packed: UInt8[np.ndarray, "n bytes"]
-    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    def shape_posterior(self, packed: UInt8[np.ndarray, "n bytes"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
         """Mean and scale of the latent of true shapes."""
 
     def prior_mean(self) -> Float[np.ndarray, "labels d"]:
@@ -82,8 +80,11 @@ class ShapeModel(Protocol):
 
 
 def measure_objects(
-    truth: Sequence[SceneTruth], answers: Sequence[Observations], slots: Sequence[Int[np.ndarray, " _"]],
-    scenes: Sequence[int], model: ShapeModel,
+    truth: Sequence[SceneTruth],
+    answers: Sequence[ObjectPosteriors],
+    slots: Sequence[Int[np.ndarray, " _"]],
+    scenes: Sequence[int],
+    model: ShapeModel,
 ) -> ObjectRecords:
     """Compare the answers at true boxes with the truth.
 
@@ -166,11 +167,13 @@ def _allocentric(R: Float[np.ndarray, "n 3 3"], ray: Float[np.ndarray, "n 3"]) -
 
 
 def _orientation(
-    viewpoint: Float[np.ndarray, "n 3"], symmetry: Int[np.ndarray, " n"], answers: Sequence[Observations]
+    viewpoint: Float[np.ndarray, "n 3"], symmetry: Int[np.ndarray, " n"], answers: Sequence[ObjectPosteriors]
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Mass, log density and ranked score of the azimuth posteriors at the truth; a free axis has no azimuth."""
-    parts = {name: np.concatenate([getattr(a.viewpoint_modes, name) for a in answers]).astype(np.float64)
-             for name in ("weights", "azimuth", "concentration")}  # fmt: skip
+    parts = {
+        name: np.concatenate([getattr(a.viewpoint_modes, name) for a in answers]).astype(np.float64)
+        for name in ("weights", "azimuth", "concentration")
+    }
     result = {name: np.full(len(symmetry), np.nan) for name in ("azimuth_mass", "azimuth_log_density", "azimuth_crps")}
     rows = np.flatnonzero(np.isfinite(viewpoint[:, 0]) & (symmetry != 0))
     if not len(rows):
@@ -190,8 +193,11 @@ def _orientation(
 
 
 def _shape(
-    packed: UInt8[np.ndarray, "n bytes"], category: Int[np.ndarray, " n"], latent: Float[np.ndarray, "n d"],
-    latent_scale: Float[np.ndarray, "n d"], model: ShapeModel,
+    packed: UInt8[np.ndarray, "n bytes"],
+    category: Int[np.ndarray, " n"],
+    latent: Float[np.ndarray, "n d"],
+    latent_scale: Float[np.ndarray, "n d"],
+    model: ShapeModel,
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Voxel figures and the mass of the latent's region, NaN where the true shape is unknown."""
     names = ("latent_mass", "voxel_iou", "category_iou", "teacher_iou", "voxel_ap")
@@ -267,8 +273,12 @@ def measure_detections(
         concerned = [(c == label) | (c < 0) for c in truth_categories]
         ignore = [(~n | (c < 0))[k] for n, c, k in zip(counts, truth_categories, concerned)]
         return match(
-            [b[k] for b, k in zip(boxes, own)], [s[k] for s, k in zip(score, own)],
-            [t[k] for t, k in zip(truth_boxes, concerned)], ignore, iou_threshold, regions,
-        )  # fmt: skip
+            [b[k] for b, k in zip(boxes, own)],
+            [s[k] for s, k in zip(score, own)],
+            [t[k] for t, k in zip(truth_boxes, concerned)],
+            ignore,
+            iou_threshold,
+            regions,
+        )
 
     return DetectionRecords(found, tuple(of(label) for label in range(labels)))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.metrics.intervals import Estimate, estimate, resample_weights, widened
+from nolbo_ppl.metrics.intervals import IntervalEstimate, estimate, resample_weights, widened
 from nolbo_ppl.metrics.statistics import weighted_mean, weighted_median
 
 SCORES = ("evidence", "overlap", "euclidean")
@@ -23,8 +23,11 @@ SCORES = ("evidence", "overlap", "euclidean")
 
 
 def log_evidence_ratio(
-    mean_a: Float[np.ndarray, "n d"], scale_a: Float[np.ndarray, "n d"], mean_b: Float[np.ndarray, "m d"],
-    scale_b: Float[np.ndarray, "m d"], prior_mean: Float[np.ndarray, " d"],
+    mean_a: Float[np.ndarray, "n d"],
+    scale_a: Float[np.ndarray, "n d"],
+    mean_b: Float[np.ndarray, "m d"],
+    scale_b: Float[np.ndarray, "m d"],
+    prior_mean: Float[np.ndarray, " d"],
 ) -> Float[np.ndarray, "n m"]:
     """`log int q_a(z) q_b(z) / p(z) dz` of every pair, nats, for diagonal Gaussians and the prior N(prior_mean, I).
 
@@ -41,7 +44,9 @@ def log_evidence_ratio(
 
 
 def log_overlap(
-    mean_a: Float[np.ndarray, "n d"], scale_a: Float[np.ndarray, "n d"], mean_b: Float[np.ndarray, "m d"],
+    mean_a: Float[np.ndarray, "n d"],
+    scale_a: Float[np.ndarray, "n d"],
+    mean_b: Float[np.ndarray, "m d"],
     scale_b: Float[np.ndarray, "m d"],
 ) -> Float[np.ndarray, "n m"]:
     """`log int q_a(z) q_b(z) dz = log N(mean_a; mean_b, scale_a^2 + scale_b^2)` of every pair, nats."""
@@ -78,7 +83,9 @@ class RetrievalRecords:
 
 
 def retrieve(
-    mean: Float[np.ndarray, "n 2 d"], scale: Float[np.ndarray, "n 2 d"], category: Int[np.ndarray, " n"],
+    mean: Float[np.ndarray, "n 2 d"],
+    scale: Float[np.ndarray, "n 2 d"],
+    category: Int[np.ndarray, " n"],
     prior_mean: Float[np.ndarray, "labels d"],
 ) -> RetrievalRecords:
     """Seek every instance's other view among those of its category.
@@ -112,13 +119,11 @@ def retrieve(
     return RetrievalRecords(category, gallery, rank)
 
 
-def retrieval_figures(
-    records: RetrievalRecords, rng: np.random.Generator, resamples: int = 500
-) -> dict[str, Estimate]:
+def retrieval_figures(records: RetrievalRecords, rng: np.random.Generator, resamples: int = 500) -> dict[str, IntervalEstimate]:
     """Recalls and the median place with 95 % intervals: bootstrap over the instances that are sought."""
     weights = resample_weights(len(records), resamples, rng)
 
-    def recall(name: str, places: int) -> Estimate:
+    def recall(name: str, places: int) -> IntervalEstimate:
         found = (records.rank[name] <= places).mean(1)
         return widened(estimate(lambda w: weighted_mean(found, w), weights, len(found)))
 

@@ -16,14 +16,26 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords
 from nolbo_ppl.metrics.calibration import expected_calibration_error, top_label
 from nolbo_ppl.metrics.detection import Matches, average_precision
-from nolbo_ppl.metrics.intervals import Estimate, estimate, resample_weights, widened
+from nolbo_ppl.metrics.intervals import IntervalEstimate, estimate, resample_weights, widened
 from nolbo_ppl.metrics.statistics import Weights, by_group, mean_of_defined, weighted_mean, weighted_median
 from nolbo_ppl.metrics.viewpoint_error import ACCURATE
 
 REQUIRED = (
-    "ap50", "map50", "category_accuracy", "acc_pi6", "med_err_deg", "acc_pi6_all", "voxel_iou", "voxel_iou_gain", "voxel_ap",
-    "ece_objectness", "ece_class", "coverage90_orientation", "coverage90_position", "coverage90_latent",
-)  # fmt: skip
+    "ap50",
+    "map50",
+    "category_accuracy",
+    "acc_pi6",
+    "med_err_deg",
+    "acc_pi6_all",
+    "voxel_iou",
+    "voxel_iou_gain",
+    "voxel_ap",
+    "ece_objectness",
+    "ece_class",
+    "coverage90_orientation",
+    "coverage90_position",
+    "coverage90_latent",
+)
 """The figures every evaluation reports."""
 LEVEL = 0.9
 """Probability of the posterior regions whose coverage is reported."""
@@ -38,7 +50,7 @@ def figures(
     symmetry: Sequence[int],
     rng: np.random.Generator,
     resamples: int = 500,
-) -> dict[str, Estimate]:
+) -> dict[str, IntervalEstimate]:
     """Every figure with its 95 % interval: percentile bootstrap over scenes, proportions widened to Wilson's interval.
 
     Args:
@@ -53,7 +65,7 @@ def figures(
     plain = np.flatnonzero(np.asarray(symmetry) == 1)
     groups = len(symmetry)
 
-    def pooled(value: Float[np.ndarray, " n"], *, proportion: bool = False, median: bool = False) -> Estimate:
+    def pooled(value: Float[np.ndarray, " n"], *, proportion: bool = False, median: bool = False) -> IntervalEstimate:
         rows = np.isfinite(value)
         scene, kept = objects.scene[rows], value[rows]
         average = weighted_median if median else weighted_mean
@@ -62,7 +74,7 @@ def figures(
 
     def over_categories(
         value: Float[np.ndarray, " n"], which: Int[np.ndarray, " k"], average: Callable[..., np.ndarray] = weighted_mean
-    ) -> Estimate:
+    ) -> IntervalEstimate:
         rows = np.isfinite(value) & np.isin(objects.category, which)
         scene, kept, group = objects.scene[rows], value[rows], objects.category[rows]
 
@@ -132,13 +144,11 @@ def _count(matches: Sequence[Matches]) -> int:
     return int(sum(one.truths.sum() for one in matches))
 
 
-def _objectness_error(found: Matches, weights: Float[np.ndarray, "b scenes"]) -> Estimate:
+def _objectness_error(found: Matches, weights: Float[np.ndarray, "b scenes"]) -> IntervalEstimate:
     """Calibration error of objectness over the detections, right where they match a truth."""
     kept = judged(found)
     score, correct, scene = found.score[kept], found.correct[kept], found.scene[kept]
-    return estimate(
-        lambda w: expected_calibration_error(score, correct, w[:, scene]), weights, len(score), pivotal=True
-    )
+    return estimate(lambda w: expected_calibration_error(score, correct, w[:, scene]), weights, len(score), pivotal=True)
 
 
 def judged(found: Matches) -> Bool[np.ndarray, " n"]:
@@ -146,19 +156,15 @@ def judged(found: Matches) -> Bool[np.ndarray, " n"]:
     return ~found.ignored & (found.score >= LEAST_OBJECTNESS)
 
 
-def _class_error(objects: ObjectRecords, weights: Float[np.ndarray, "b scenes"]) -> Estimate:
+def _class_error(objects: ObjectRecords, weights: Float[np.ndarray, "b scenes"]) -> IntervalEstimate:
     """Top-label calibration error of the class posterior."""
     rows = objects.category >= 0
     confidence, right = top_label(objects.class_posterior[rows], objects.category[rows])
     scene = objects.scene[rows]
-    return estimate(
-        lambda w: expected_calibration_error(confidence, right, w[:, scene]), weights, len(scene), pivotal=True
-    )
+    return estimate(lambda w: expected_calibration_error(confidence, right, w[:, scene]), weights, len(scene), pivotal=True)
 
 
-def category_table(
-    objects: ObjectRecords, detections: DetectionRecords, categories: Sequence[str]
-) -> dict[str, dict[str, Any]]:
+def category_table(objects: ObjectRecords, detections: DetectionRecords, categories: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The figures of each category, and how many objects are behind them; None where nothing is to be measured."""
     table = {}
     for label, name in enumerate(categories):

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from nolbo_ppl.evaluation.sequence_truth import DriveTruth, Matched
+from nolbo_ppl.evaluation.sequence_truth import DriveTruth, MatchResult
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.inference.slam.detection_features import weighted_latents
-from nolbo_ppl.io.observations import ObservationTable
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.calibration import chi_square_mass, coverage
 from nolbo_ppl.metrics.trajectory import umeyama
@@ -37,9 +37,7 @@ class ShapeModel(Protocol):
     def decode(self, latent: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n v v v"]:
         """Occupancy probabilities of latents."""
 
-    def shape_posterior(
-        self, packed: UInt8[np.ndarray, "n bytes"]
-    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    def shape_posterior(self, packed: UInt8[np.ndarray, "n bytes"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
         """Mean and scale of the latent of true shapes."""
 
 
@@ -53,7 +51,7 @@ def band_name(low: float, high: float) -> str:
     return f"{low:g} m and more" if np.isinf(high) else f"{low:g}-{high:g} m"
 
 
-def matched_truth(matched: Matched, frame: Int[np.ndarray, " k"], truth: DriveTruth) -> dict[str, np.ndarray]:
+def matched_truth(matched: MatchResult, frame: Int[np.ndarray, " k"], truth: DriveTruth) -> dict[str, np.ndarray]:
     """True position and rotation of each matched detection, NaN for the others."""
     position, rotation = np.full((len(frame), 3), np.nan), np.full((len(frame), 3, 3), np.nan)
     for k in np.flatnonzero(matched.object >= 0):
@@ -62,7 +60,7 @@ def matched_truth(matched: Matched, frame: Int[np.ndarray, " k"], truth: DriveTr
     return {"position": position, "rotation": rotation}
 
 
-def detection_figures(matched: Matched, table: ObservationTable, truth: DriveTruth) -> dict[str, Any]:
+def detection_figures(matched: MatchResult, table: Detections, truth: DriveTruth) -> dict[str, Any]:
     """Recall, precision, share of right categories, median orientation error of the objects that count."""
     rows = np.flatnonzero(matched.counted)
     true = matched_truth(matched, table.frame, truth)
@@ -93,15 +91,20 @@ def position_figures(
         if rows.any():
             share = error[rows] / distance[rows]
             out[name] = {
-                "count": int(rows.sum()), "median": finite(np.median(error[rows])), "p90": finite(np.quantile(error[rows], 0.9)),
-                "median_share": finite(np.median(share)), "p90_share": finite(np.quantile(share, 0.9)),
-            }  # fmt: skip
+                "count": int(rows.sum()),
+                "median": finite(np.median(error[rows])),
+                "p90": finite(np.quantile(error[rows], 0.9)),
+                "median_share": finite(np.median(share)),
+                "p90_share": finite(np.quantile(share, 0.9)),
+            }
     return out
 
 
 def orientation_mass(
-    modes: Sequence[Sequence[Mapping[str, float]]], position: Float[np.ndarray, "k 3"],
-    R_camera_object: Float[np.ndarray, "k 3 3"], symmetry: Int[np.ndarray, " k"],
+    modes: Sequence[Sequence[Mapping[str, float]]],
+    position: Float[np.ndarray, "k 3"],
+    R_camera_object: Float[np.ndarray, "k 3 3"],
+    symmetry: Int[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"]:
     """Mass of the azimuth posterior's highest-density region that reaches out to the truth.
 
@@ -119,15 +122,20 @@ def orientation_mass(
         for j, mode in enumerate(one):
             weight[i, j], mean[i, j], concentration[i, j] = mode["weight"], mode["azimuth"], mode["concentration"]
     posterior = VonMisesMixture.from_mean_concentration(
-        torch.from_numpy(np.log(np.maximum(weight, 1e-300))), torch.from_numpy(mean), torch.from_numpy(concentration),
+        torch.from_numpy(np.log(np.maximum(weight, 1e-300))),
+        torch.from_numpy(mean),
+        torch.from_numpy(concentration),
         max_concentration=float(concentration.max()) + 1,
-    )  # fmt: skip
+    )
     R = egocentric_to_allocentric(torch.from_numpy(R_camera_object), torch.from_numpy(position))
     return posterior.hpd_mass(matrix_to_viewpoint(R)[:, 0], torch.from_numpy(symmetry)).numpy()
 
 
 def coverage_figures(
-    matched: Matched, table: ObservationTable, modes: Sequence[Sequence[Mapping[str, float]] | None], truth: DriveTruth,
+    matched: MatchResult,
+    table: Detections,
+    modes: Sequence[Sequence[Mapping[str, float]] | None],
+    truth: DriveTruth,
     model: ShapeModel | None,
 ) -> dict[str, Any]:
     """Share of the truths inside the 90 % regions of position, orientation (azimuth) and latent."""
@@ -167,11 +175,14 @@ def loop_figures(
     unjudged = association_pairs(frame[unknown], object_of[unknown], landmark_of[unknown], gap).found_pairs
     judged = score.found_pairs - unjudged
     return {
-        "gap_frames": gap, "true_pairs": score.true_pairs, "found_pairs": score.found_pairs, "unlabelled_pairs": unjudged,
+        "gap_frames": gap,
+        "true_pairs": score.true_pairs,
+        "found_pairs": score.found_pairs,
+        "unlabelled_pairs": unjudged,
         "precision": finite(score.correct_pairs / judged) if judged else None,
         "precision_strict": finite(score.precision) if score.found_pairs else None,
         "recall": finite(score.recall) if score.true_pairs else None,
-    }  # fmt: skip
+    }
 
 
 def owners(
@@ -188,8 +199,12 @@ def owners(
 
 
 def map_figures(
-    object_of: Int[np.ndarray, " k"], owner: Int[np.ndarray, " m"], purity: Float[np.ndarray, " m"],
-    exists: Bool[np.ndarray, " m"], truth: DriveTruth, least_detections: int,
+    object_of: Int[np.ndarray, " k"],
+    owner: Int[np.ndarray, " m"],
+    purity: Float[np.ndarray, " m"],
+    exists: Bool[np.ndarray, " m"],
+    truth: DriveTruth,
+    least_detections: int,
 ) -> dict[str, Any]:
     """Landmarks against the objects that were detected often enough to be mapped."""
     counts = np.bincount(object_of[object_of >= 0], minlength=len(truth))
@@ -207,7 +222,10 @@ def map_figures(
 
 
 def landmark_errors(
-    position: Float[np.ndarray, "m 3"], owner: Int[np.ndarray, " m"], truth: DriveTruth, estimate: Float[np.ndarray, "n 4 4"],
+    position: Float[np.ndarray, "m 3"],
+    owner: Int[np.ndarray, " m"],
+    truth: DriveTruth,
+    estimate: Float[np.ndarray, "n 4 4"],
     T_world_camera: Float[np.ndarray, "n 4 4"],
 ) -> Float[np.ndarray, " m"]:
     """Distance of each landmark from its object, m, after the estimated path was laid onto the true one; NaN without one."""
@@ -218,8 +236,13 @@ def landmark_errors(
 
 
 def shape_figures(
-    table: ObservationTable, landmark_of: Int[np.ndarray, " k"], owner: Int[np.ndarray, " m"], truth: DriveTruth,
-    model: ShapeModel, rng: np.random.Generator, views: Sequence[int] = VIEWS,
+    table: Detections,
+    landmark_of: Int[np.ndarray, " k"],
+    owner: Int[np.ndarray, " m"],
+    truth: DriveTruth,
+    model: ShapeModel,
+    rng: np.random.Generator,
+    views: Sequence[int] = VIEWS,
 ) -> dict[str, Any] | None:
     """Mean voxel IoU of the same landmarks from 1, 3, 10 of their detections; None where none has enough.
 
@@ -248,5 +271,3 @@ def shape_figures(
         return None
     iou = voxel_iou(decoded, np.repeat(np.stack(truths), len(views), axis=0)).reshape(-1, len(views)).mean(axis=0)
     return {"landmarks": groups, "iou": {str(n): finite(value) for n, value in zip(views, iou)}}
-
-

@@ -125,7 +125,7 @@ def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
 
 
 @dataclass(frozen=True)
-class Matched:
+class MatchResult:
     """Whose each detection is."""
 
     object: Int[np.ndarray, " k"]
@@ -169,9 +169,12 @@ def object_shown(
 
 
 def match_detections(
-    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], objectness: Float[np.ndarray, " k"], truth: DriveTruth,
+    frame: Int[np.ndarray, " k"],
+    box: Float[np.ndarray, "k 4"],
+    objectness: Float[np.ndarray, " k"],
+    truth: DriveTruth,
     iou_threshold: float = IOU,
-) -> Matched:
+) -> MatchResult:
     """Match detections with the objects of their frames, greedily by objectness, at most one an object (as COCO does)."""
     object_of, row_of = np.full(len(frame), -1), np.full(len(frame), -1)
     counted = np.zeros(len(frame), dtype=bool)
@@ -184,4 +187,4 @@ def match_detections(
         counted[rows[hit]] = counts[matched[hit]]
         found += int(counts[matched[hit]].sum())
         wanted += int(counts.sum())
-    return Matched(object_of, row_of, counted, found, wanted)
+    return MatchResult(object_of, row_of, counted, found, wanted)

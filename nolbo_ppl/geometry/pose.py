@@ -41,16 +41,21 @@ def quaternion_to_matrix(quaternion: Float[np.ndarray, "... 4"]) -> Float[np.nda
     q = np.asarray(quaternion, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
     ]
     return np.stack(rows, axis=-1).reshape(*x.shape, 3, 3)
 
 
 def matrix_to_quaternion(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "... 4"]:
-    """Quaternion [qx, qy, qz, qw] with qw >= 0, by the largest of the four candidates (never divides by a small one).
-    """
+    """Quaternion [qx, qy, qz, qw] with qw >= 0, by the largest of the four candidates (never divides by a small one)."""
     R = np.asarray(R, dtype=np.float64)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the outer product of the quaternion with itself: its best-conditioned column is the quaternion.

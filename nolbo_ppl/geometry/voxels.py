@@ -28,9 +28,7 @@ def pack_voxels(voxels: Bool[np.ndarray, "*batch n n n"]) -> UInt8[np.ndarray, "
     if voxels.ndim < 3 or len(set(voxels.shape[-3:])) != 1:
         raise input_error("voxel grid to pack", got=f"shape {voxels.shape}", expected="[..., n, n, n]")
     if voxels.dtype != bool:
-        raise input_error(
-            "voxel grid to pack", got=f"dtype {voxels.dtype}", expected="bool", do="compare with a threshold first"
-        )
+        raise input_error("voxel grid to pack", got=f"dtype {voxels.dtype}", expected="bool", do="compare with a threshold first")
     return np.packbits(voxels.reshape(*voxels.shape[:-3], voxels.shape[-1] ** 3), axis=-1)
 
 

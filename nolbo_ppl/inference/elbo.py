@@ -23,6 +23,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 from torch.distributions import kl_divergence
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import NolboError, input_error
 
 KL_TERMS = {
@@ -99,7 +100,7 @@ class ElboResult:
     """Weighted negative sum, divided by the number of scenes."""
 
 
-class SceneElbo:
+class SceneELBO:
     """Bound and inclusive terms of a model and guide, through their Pyro traces.
 
     Args:
@@ -258,7 +259,7 @@ class SceneLoss(torch.nn.Module):
         elbo: the weighted terms.
     """
 
-    def __init__(self, story: torch.nn.Module, guide: torch.nn.Module, elbo: SceneElbo) -> None:
+    def __init__(self, story: torch.nn.Module, guide: torch.nn.Module, elbo: SceneELBO) -> None:
         super().__init__()
         self.story, self.guide, self.elbo = story, guide, elbo
 
@@ -267,3 +268,5 @@ class SceneLoss(torch.nn.Module):
         scene = self.guide.observe(batch)  # type: ignore[operator]
         return self.elbo.evaluate(self.story, self.guide, scene, scenes=len(batch.image), decode=decode)
 
+
+__getattr__ = renamed(__name__, {"SceneElbo": "SceneELBO"})

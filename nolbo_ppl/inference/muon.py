@@ -67,9 +67,7 @@ class MuonAdamW(torch.optim.Optimizer):
         self._flat = [nn.Parameter(p.detach().flatten(1).clone()) for p in hidden]
         self._parts: list[torch.optim.Optimizer] = []
         if hidden:
-            self._parts.append(
-                torch.optim.Muon(self._flat, lr=lr, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
-            )
+            self._parts.append(torch.optim.Muon(self._flat, lr=lr, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw"))
             for p, flat in zip(hidden, self._flat):
                 self.state[p] = self._parts[0].state[flat]
         for part in rest:

@@ -54,24 +54,40 @@ def checked(values: CameraIntrinsics, size: tuple[int, int] | None, file: Path, 
     """
     vector = values.vector
     if not np.isfinite(vector).all() or (vector[:2] <= 0).any():
-        raise input_error("intrinsics", got=vector.tolist(), expected="finite fx fy cx cy, focal lengths above 0",
-                          file=file, line=line)
+        raise input_error(
+            "intrinsics", got=vector.tolist(), expected="finite fx fy cx cy, focal lengths above 0", file=file, line=line
+        )
     if size is None:
         return values
     width, height = size
     stated = (values.width or width, values.height or height)
     if stated != (width, height):
-        raise input_error("intrinsics of images of another size", got=f"{stated[0]} x {stated[1]} px",
-                          expected=f"{width} x {height} px", do="scale fx, cx by the widths and fy, cy by the heights",
-                          file=file, line=line)
+        raise input_error(
+            "intrinsics of images of another size",
+            got=f"{stated[0]} x {stated[1]} px",
+            expected=f"{width} x {height} px",
+            do="scale fx, cx by the widths and fy, cy by the heights",
+            file=file,
+            line=line,
+        )
     if not (0 < values.cx < width and 0 < values.cy < height):
-        raise input_error("principal point outside the image", got=f"({values.cx:g}, {values.cy:g})",
-                          expected=f"inside {width} x {height} px", do="are these the intrinsics of these images?",
-                          file=file, line=line)
+        raise input_error(
+            "principal point outside the image",
+            got=f"({values.cx:g}, {values.cy:g})",
+            expected=f"inside {width} x {height} px",
+            do="are these the intrinsics of these images?",
+            file=file,
+            line=line,
+        )
     longer = max(width, height)
     if not (0.1 * longer < values.fx < 20 * longer and 0.1 * longer < values.fy < 20 * longer):
-        raise input_error("focal length does not fit the image", got=f"{values.fx:g}, {values.fy:g} px",
-                          expected=f"between {0.1 * longer:g} and {20 * longer:g} px", file=file, line=line)
+        raise input_error(
+            "focal length does not fit the image",
+            got=f"{values.fx:g}, {values.fy:g} px",
+            expected=f"between {0.1 * longer:g} and {20 * longer:g} px",
+            file=file,
+            line=line,
+        )
     return CameraIntrinsics(values.fx, values.fy, values.cx, values.cy, width, height)
 
 
@@ -84,8 +100,9 @@ def _from_json(path: Path) -> CameraIntrinsics:
         value = content.get(name)
         missing = value is None and name in NAMES
         if missing or isinstance(value, bool) or not isinstance(value, int | float | None):
-            raise input_error(f"intrinsics: {name}", got="nothing" if value is None else repr(value), expected="a number",
-                              file=path)
+            raise input_error(
+                f"intrinsics: {name}", got="nothing" if value is None else repr(value), expected="a number", file=path
+            )
         values[name] = value
     for name in ("width", "height"):
         value = values[name]
@@ -107,20 +124,28 @@ def _from_text(path: Path) -> tuple[CameraIntrinsics, int]:
                 number, words = labelled[label]
                 values = _numbers(words, path, number)
                 if len(values) != 12:
-                    raise input_error(f"{label} of a KITTI calibration", got=f"{len(values)} numbers", expected="12",
-                                      file=path, line=number)
+                    raise input_error(
+                        f"{label} of a KITTI calibration", got=f"{len(values)} numbers", expected="12", file=path, line=number
+                    )
                 matrix = np.array(values).reshape(3, 4)
                 if abs(matrix[0, 1]) > 1e-6 or not np.allclose(matrix[2, :3], [0, 0, 1]):
                     raise input_error(f"{label} is no projection of a rectified camera", file=path, line=number)
                 return CameraIntrinsics(values[0], values[5], values[2], values[6]), number
-        raise input_error("no known row of a KITTI calibration", got=", ".join(labelled),
-                          expected="one of " + ", ".join(KITTI_ROWS), file=path)
+        raise input_error(
+            "no known row of a KITTI calibration", got=", ".join(labelled), expected="one of " + ", ".join(KITTI_ROWS), file=path
+        )
     flat = [value for number, words in rows for value in _numbers(words, path, number)]
     if len(flat) == 9 and flat[3] == flat[6] == flat[7] == 0 and flat[8] == 1:
         flat = [flat[0], flat[4], flat[2], flat[5]]  # a camera matrix
     if len(flat) != 4:
-        raise input_error("intrinsics", got=f"{len(flat)} numbers", expected="fx fy cx cy", do="images must be undistorted",
-                          file=path, line=rows[0][0])
+        raise input_error(
+            "intrinsics",
+            got=f"{len(flat)} numbers",
+            expected="fx fy cx cy",
+            do="images must be undistorted",
+            file=path,
+            line=rows[0][0],
+        )
     fx, fy, cx, cy = flat
     return CameraIntrinsics(fx, fy, cx, cy), rows[0][0]
 

@@ -73,8 +73,12 @@ def read_jsonl(path: str | os.PathLike[str]) -> Iterator[tuple[int, dict[str, An
                 row = json.loads(text, parse_constant=_refuse_constant)
             except ValueError as error:
                 raise input_error(
-                    "not a line of JSON", got=f"{text.strip()[:80]!r} ({error})", expected="one JSON object a line",
-                    do="is the file truncated?", file=path, line=number,
+                    "not a line of JSON",
+                    got=f"{text.strip()[:80]!r} ({error})",
+                    expected="one JSON object a line",
+                    do="is the file truncated?",
+                    file=path,
+                    line=number,
                 ) from None
             if not isinstance(row, dict):
                 raise input_error("not a JSON object", got=type(row).__name__, expected="{...}", file=path, line=number)

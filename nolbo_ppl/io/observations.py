@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import matrix_to_quaternion, quaternion_to_matrix
 from nolbo_ppl.io.files import read_jsonl, write_jsonl
 from nolbo_ppl.structures.detections import (
     ARRAYS,
     MAXIMUM_DISTANCE,
-    ObservationTable,
+    Detections,
     check_table,
     concatenate,
     heaviest_mode,
@@ -36,9 +37,7 @@ def _vector(row: dict[str, Any], key: str, length: int | None, where: dict[str, 
     except (TypeError, ValueError):
         raise input_error(f"`{key}` is not numeric", got=value, **where) from None
     if vector.ndim != 1 or (length is not None and len(vector) != length):
-        raise input_error(
-            f"`{key}` has the wrong shape", got=value, expected=f"a list of {length or 'd'} numbers", **where
-        )
+        raise input_error(f"`{key}` has the wrong shape", got=value, expected=f"a list of {length or 'd'} numbers", **where)
     if not np.isfinite(vector).all():
         raise input_error(f"`{key}` is not finite", got=value, **where)
     return vector
@@ -46,11 +45,7 @@ def _vector(row: dict[str, Any], key: str, length: int | None, where: dict[str, 
 
 def _scale(row: dict[str, Any], key: str, length: int, where: dict[str, Any]) -> np.ndarray:
     value = row[key]
-    vector = (
-        np.full(length, value, dtype=np.float64)
-        if isinstance(value, (int, float))
-        else _vector(row, key, length, where)
-    )
+    vector = np.full(length, value, dtype=np.float64) if isinstance(value, (int, float)) else _vector(row, key, length, where)
     if not (np.isfinite(vector).all() and (vector > 0).all()):
         raise input_error(f"`{key}` is no standard deviation", got=value, expected="greater than 0", **where)
     return vector
@@ -81,21 +76,31 @@ def _rotation(row: dict[str, Any], where: dict[str, Any], name: str = "rotation"
     quaternion = _vector(row, "rotation", 4, where)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > 1e-2:
-        raise input_error(f"`{name}` is no unit quaternion", got=f"length {norm:.4g}", expected="1",
-                          do="normalise it; the order is [qx, qy, qz, qw]", **where)
+        raise input_error(
+            f"`{name}` is no unit quaternion",
+            got=f"length {norm:.4g}",
+            expected="1",
+            do="normalise it; the order is [qx, qy, qz, qw]",
+            **where,
+        )
     return quaternion_to_matrix(quaternion)
 
 
 def _modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
     """The modes of an orientation; weights sum to one."""
     if not isinstance(value, list) or not value or not all(isinstance(mode, dict) for mode in value):
-        raise input_error("`rotation_modes` is no list of modes", got=value,
-                          expected='[{"weight": w, "rotation": [qx, qy, qz, qw], "std": rad}, ...]', **where)
+        raise input_error(
+            "`rotation_modes` is no list of modes",
+            got=value,
+            expected='[{"weight": w, "rotation": [qx, qy, qz, qw], "std": rad}, ...]',
+            **where,
+        )
     weight = []
     for i, mode in enumerate(value):
         if set(mode) != {"weight", "rotation", "std"}:
-            raise input_error(f"`rotation_modes` {i} has wrong fields", got=sorted(mode),
-                              expected="weight, rotation, std", **where)
+            raise input_error(
+                f"`rotation_modes` {i} has wrong fields", got=sorted(mode), expected="weight, rotation, std", **where
+            )
         w = mode["weight"]
         if isinstance(w, bool) or not isinstance(w, (int, float)) or not np.isfinite(w) or w < 0:
             raise input_error(f"`rotation_modes` {i}: `weight` is no weight", got=w, expected="0 or more", **where)
@@ -120,9 +125,7 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
         raise input_error("`frame` is no row number", got=frame, expected="an integer from 0", **where)
     out: dict[str, Any] = {"frame": frame, "position": _vector(row, "position", 3, where)}
     if np.abs(out["position"]).max() > MAXIMUM_DISTANCE:
-        raise input_error(
-            "`position` out of range", got=row["position"], expected=f"within {MAXIMUM_DISTANCE:g} m", **where
-        )
+        raise input_error("`position` out of range", got=row["position"], expected=f"within {MAXIMUM_DISTANCE:g} m", **where)
     if row.get("position_cov") is not None:
         try:
             covariance = np.asarray(row["position_cov"], dtype=np.float64)
@@ -130,12 +133,13 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
             covariance = np.zeros(0)
         if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
             raise input_error("`position_cov` is no 3x3 matrix", got=row["position_cov"], **where)
-        if (
-            np.abs(covariance - covariance.T).max() > 1e-6 * np.abs(covariance).max()
-            or np.linalg.eigvalsh(covariance)[0] <= 0
-        ):
-            raise input_error("`position_cov` is not positive definite", got=row["position_cov"],
-                              expected="symmetric with positive eigenvalues", **where)
+        if np.abs(covariance - covariance.T).max() > 1e-6 * np.abs(covariance).max() or np.linalg.eigvalsh(covariance)[0] <= 0:
+            raise input_error(
+                "`position_cov` is not positive definite",
+                got=row["position_cov"],
+                expected="symmetric with positive eigenvalues",
+                **where,
+            )
         out["position_covariance"] = covariance
     elif row.get("position_std") is not None:
         out["position_covariance"] = np.diag(_scale(row, "position_std", 3, where) ** 2)
@@ -171,7 +175,7 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def read_observations(path: str | PathLike[str], frames: int | None = None) -> ObservationTable:
+def read_observations(path: str | PathLike[str], frames: int | None = None) -> Detections:
     """Read observations from JSON Lines.
 
     Args:
@@ -193,19 +197,16 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
             raise input_error("unknown field", got=sorted(unknown), expected=f"some of {sorted(_KNOWN)}", **where)
         values = _parse(row, where)
         if frames is not None and values["frame"] >= frames:
-            raise input_error("`frame` out of range", got=values["frame"],
-                              expected=f"0 to {frames - 1}, a row of the odometry", **where)
+            raise input_error(
+                "`frame` out of range", got=values["frame"], expected=f"0 to {frames - 1}, a row of the odometry", **where
+            )
         if "latent" in values:
             if dimension not in (None, len(values["latent"])):
-                raise input_error(
-                    "latents of different lengths", got=len(values["latent"]), expected=dimension, **where
-                )
+                raise input_error("latents of different lengths", got=len(values["latent"]), expected=dimension, **where)
             dimension = len(values["latent"])
         identity = str(row["id"]) if row.get("id") is not None else f"line-{number}"
         if identity in ids:
-            raise input_error(
-                "duplicate id", got=identity, expected=f"an id of its own (line {ids[identity]} has it)", **where
-            )
+            raise input_error("duplicate id", got=identity, expected=f"an id of its own (line {ids[identity]} has it)", **where)
         ids[identity] = number
         values["id"] = identity
         rows.append(values)
@@ -220,30 +221,41 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> O
         "size": np.full(3, np.nan),
     }
     padding = {"mode_weight": np.zeros(K), "mode_rotation": np.tile(np.eye(3), (K, 1, 1)), "mode_std": np.ones(K)}
-    shapes = {"position": (3,), "position_covariance": (3, 3), "rotation": (3, 3), "latent": (d,), "latent_scale": (d,),
-              "size": (3,), "mode_weight": (K,), "mode_rotation": (K, 3, 3), "mode_std": (K,)}
+    shapes = {
+        "position": (3,),
+        "position_covariance": (3, 3),
+        "rotation": (3, 3),
+        "latent": (d,),
+        "latent_scale": (d,),
+        "size": (3,),
+        "mode_weight": (K,),
+        "mode_rotation": (K, 3, 3),
+        "mode_std": (K,),
+    }
 
     def column(name: str) -> np.ndarray:
         if name in padding:  # rows with fewer modes are padded
-            values = [np.concatenate([row[name], padding[name][len(row[name]):]]) if name in row else padding[name]
-                      for row in rows]
+            values = [
+                np.concatenate([row[name], padding[name][len(row[name]) :]]) if name in row else padding[name] for row in rows
+            ]
         else:
             values = [row.get(name, missing.get(name)) for row in rows]
         dtype = np.int64 if name in ("frame", "symmetry") else np.float64
         return np.array(values, dtype=dtype).reshape(len(rows), *shapes.get(name, ()))
 
-    return ObservationTable(
+    return Detections(
         **{name: column(name) for name in ARRAYS},
-        category=tuple(row["category"] for row in rows), id=tuple(row["id"] for row in rows),
+        category=tuple(row["category"] for row in rows),
+        id=tuple(row["id"] for row in rows),
     )
 
 
-def write_observations(path: str | PathLike[str], table: ObservationTable) -> None:
+def write_observations(path: str | PathLike[str], table: Detections) -> None:
     """Write a table as JSON Lines, atomically; missing fields are left out."""
     write_jsonl(path, (observation_row(table, i) for i in range(len(table))))
 
 
-def observation_row(table: ObservationTable, i: int) -> dict[str, Any]:
+def observation_row(table: Detections, i: int) -> dict[str, Any]:
     """One row of a table in the form of the file."""
     row: dict[str, Any] = {"frame": int(table.frame[i]), "position": _rounded(table.position[i])}
     covariance = table.position_covariance[i]
@@ -259,9 +271,12 @@ def observation_row(table: ObservationTable, i: int) -> dict[str, Any]:
     used = np.flatnonzero(table.mode_weight[i] > 0)
     if len(used):
         row["rotation_modes"] = [
-            {"weight": float(table.mode_weight[i, k]),
-             "rotation": _rounded(matrix_to_quaternion(table.mode_rotation[i, k]), 8),
-             "std": float(table.mode_std[i, k])} for k in used
+            {
+                "weight": float(table.mode_weight[i, k]),
+                "rotation": _rounded(matrix_to_quaternion(table.mode_rotation[i, k]), 8),
+                "std": float(table.mode_std[i, k]),
+            }
+            for k in used
         ]
     if table.latent_dim and np.isfinite(table.latent[i]).all():
         row["latent"] = _rounded(table.latent[i])
@@ -284,7 +299,7 @@ def _rounded(values: np.ndarray, digits: int = 6) -> list[float]:
 
 
 __all__ = [
-    "ObservationTable",
+    "Detections",
     "check_table",
     "concatenate",
     "make_table",
@@ -292,3 +307,6 @@ __all__ = [
     "read_observations",
     "write_observations",
 ]
+
+
+__getattr__ = renamed(__name__, {"ObservationTable": "Detections"})

@@ -140,7 +140,12 @@ def _parse_object(
 
 
 def parse_record(
-    row: dict[str, Any], file: Path, line: int, categories: Sequence[str], image_size: tuple[int, int], image: Path,
+    row: dict[str, Any],
+    file: Path,
+    line: int,
+    categories: Sequence[str],
+    image_size: tuple[int, int],
+    image: Path,
     symmetries: Mapping[str, int] = CATEGORY_SYMMETRY,
 ) -> SceneRecord:
     """Check one line and turn it into a record.
@@ -181,7 +186,11 @@ def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Pat
     path = folder / name
     if not path.is_file():
         raise input_error(
-            "image", got=name, expected=f"an image file in {folder}", do="is the data set complete?",
-            file=file, line=line,
-        )  # fmt: skip
+            "image",
+            got=name,
+            expected=f"an image file in {folder}",
+            do="is the data set complete?",
+            file=file,
+            line=line,
+        )
     return path

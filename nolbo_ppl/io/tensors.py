@@ -56,9 +56,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Mapping[int, str]
     return found
 
 
-def restore_optimizer(
-    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor]
-) -> None:
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> None:
     """Put back what `optimizer_tensors` gave, bit for bit."""
     for name, tensor in tensors.items():
         parameter, key = name.rsplit("/", 1)
@@ -75,14 +73,14 @@ def load_strictly(module: torch.nn.Module, tensors: Mapping[str, Tensor], file: 
     missing, unknown = sorted(set(own) - set(tensors)), sorted(set(tensors) - set(own))
     if missing or unknown:
         raise input_error(
-            "weights do not fit the model", got=f"missing {missing[:3]}, unknown {unknown[:3]}",
-            expected="the tensors of this configuration", file=file,
+            "weights do not fit the model",
+            got=f"missing {missing[:3]}, unknown {unknown[:3]}",
+            expected="the tensors of this configuration",
+            file=file,
         )
     for name, tensor in tensors.items():
         if tensor.shape != own[name].shape:
-            raise input_error(
-                f"weight {name}", got=tuple(tensor.shape), expected=f"shape {tuple(own[name].shape)}", file=file
-            )
+            raise input_error(f"weight {name}", got=tuple(tensor.shape), expected=f"shape {tuple(own[name].shape)}", file=file)
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise input_error(f"weight {name}", got="NaN or infinity", expected="finite numbers", file=file)
     module.load_state_dict({name: tensor.to(own[name].dtype) for name, tensor in tensors.items()})

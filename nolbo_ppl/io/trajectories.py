@@ -78,14 +78,21 @@ def read_trajectory(path: str | PathLike[str]) -> Trajectory:
     width = len(rows[0][1])
     if width not in (8, 12):
         raise input_error(
-            "unknown trajectory format", got=f"{width} numbers a row", expected="12 (KITTI) or 8 (TUM)",
-            file=path, line=rows[0][0],
+            "unknown trajectory format",
+            got=f"{width} numbers a row",
+            expected="12 (KITTI) or 8 (TUM)",
+            file=path,
+            line=rows[0][0],
         )
     for number, values in rows:
         if len(values) != width:
             raise input_error(
-                "row of another length", got=f"{len(values)} numbers", expected=width, do="is the file truncated?",
-                file=path, line=number,
+                "row of another length",
+                got=f"{len(values)} numbers",
+                expected=width,
+                do="is the file truncated?",
+                file=path,
+                line=number,
             )
     table = np.array([values for _, values in rows])
     lines = [number for number, _ in rows]
@@ -94,8 +101,10 @@ def read_trajectory(path: str | PathLike[str]) -> Trajectory:
         good = is_rotation(matrices[:, :, :3], tolerance=1e-2)
         if not good.all():
             raise input_error(
-                "the left 3x3 block is no rotation", expected="orthonormal, determinant +1",
-                file=path, line=lines[int(np.argmin(good))],
+                "the left 3x3 block is no rotation",
+                expected="orthonormal, determinant +1",
+                file=path,
+                line=lines[int(np.argmin(good))],
             )
         return Trajectory(make_pose(nearest_rotation(matrices[:, :, :3]), matrices[:, :, 3]))
     norms = np.linalg.norm(table[:, 4:], axis=1)
@@ -143,8 +152,13 @@ def match_times(
 
 
 def poses_of_frames(
-    path: str | PathLike[str], frames: int, times: Float[np.ndarray, " f"] | None = None, part: slice = slice(None), *,
-    what: str = "truth", of: str = "the frames",
+    path: str | PathLike[str],
+    frames: int,
+    times: Float[np.ndarray, " f"] | None = None,
+    part: slice = slice(None),
+    *,
+    what: str = "truth",
+    of: str = "the frames",
 ) -> Float[np.ndarray, "n 4 4"]:
     """Poses of a sequence's frames, or of a part of them: rows in the order of the frames, or TUM rows matched by time.
 
@@ -171,9 +185,11 @@ def poses_of_frames(
     rows, partner = match_times(times[part], found.times)
     if len(rows) < count:
         raise input_error(
-            f"{what} lacks times of {of}", got=f"{len(rows)} of {count} matched within {1000 * TIME_TOLERANCE:.0f} ms",
-            expected="a pose for each", file=path,
-        )  # fmt: skip
+            f"{what} lacks times of {of}",
+            got=f"{len(rows)} of {count} matched within {1000 * TIME_TOLERANCE:.0f} ms",
+            expected="a pose for each",
+            file=path,
+        )
     return found.T_world_camera[partner]
 
 
@@ -191,8 +207,9 @@ def read_covariance(path: str | PathLike[str]) -> Covariances:
     except InputError:
         raise
     except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
-        raise input_error("odometry covariance cannot be read", got=error, expected="an NPZ file with `covariance`",
-                          file=path) from None
+        raise input_error(
+            "odometry covariance cannot be read", got=error, expected="an NPZ file with `covariance`", file=path
+        ) from None
     if covariance.ndim != 3 or covariance.shape[1:] != (6, 6):
         raise input_error("`covariance`", got=covariance.shape, expected="[n - 1, 6, 6], one a step", file=path)
     return covariance

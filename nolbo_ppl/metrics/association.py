@@ -84,9 +84,7 @@ def association_pairs(
     )
 
 
-def normalised_error_squared(
-    error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]
-) -> Float[np.ndarray, " n"]:
+def normalised_error_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, " n"]:
     """NEES per degree of freedom, `e' S^-1 e / d` (Bar-Shalom): 1 on average when covariances are right.
 
     Raises:

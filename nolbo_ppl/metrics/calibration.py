@@ -66,10 +66,9 @@ def expected_calibration_error(
     index = _bins(confidence, outcome, bins)
     weight = np.ones((1, len(index))) if weight is None else weight
     # |sum over a bin of (outcome - confidence)| is the bin's count times the gap of its means.
-    gap = np.stack([
-        np.abs(weight[:, index == k] @ (np.asarray(outcome, dtype=np.float64) - confidence)[index == k])
-        for k in range(bins)
-    ])
+    gap = np.stack(
+        [np.abs(weight[:, index == k] @ (np.asarray(outcome, dtype=np.float64) - confidence)[index == k]) for k in range(bins)]
+    )
     return ratio(gap.sum(0), weight.sum(1))
 
 
@@ -138,9 +137,7 @@ def chi_square_mass(
     return gammainc(d / 2, distance / 2)
 
 
-def circular_crps(
-    log_density: Float[np.ndarray, "n nodes"], truth: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def circular_crps(log_density: Float[np.ndarray, "n nodes"], truth: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Continuous ranked probability score on the circle in rad (Grimit et al. 2006, eq. 7); less is better.
 
     `E a(V, v) - E a(V, V') / 2` with the angular distance a, V and V' independent draws of the posterior, v the truth.

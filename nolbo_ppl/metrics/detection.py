@@ -65,9 +65,10 @@ def match_image(
     score, ignore = np.asarray(score, dtype=np.float64), np.asarray(ignore, dtype=bool)
     if box.shape != (len(score), 4) or truth_box.shape != (len(ignore), 4):
         raise input_error(
-            "boxes", got=f"{box.shape} with {len(score)} scores, {truth_box.shape} with {len(ignore)} ignore flags",
+            "boxes",
+            got=f"{box.shape} with {len(score)} scores, {truth_box.shape} with {len(ignore)} ignore flags",
             expected="(n, 4) with n scores, (m, 4) with m flags",
-        )  # fmt: skip
+        )
     if not np.isfinite(score).all():
         raise input_error("score of a detection", got=score[~np.isfinite(score)][0], expected="a finite number")
     matched = np.full(len(box), -1)
@@ -88,9 +89,7 @@ def match_image(
     return matched
 
 
-def in_regions(
-    box: Float[np.ndarray, "n 4"], region: Float[np.ndarray, "k 4"], share: float = 0.5
-) -> Bool[np.ndarray, " n"]:
+def in_regions(box: Float[np.ndarray, "n 4"], region: Float[np.ndarray, "k 4"], share: float = 0.5) -> Bool[np.ndarray, " n"]:
     """Whether at least `share` of a box lies in one of the regions: a region may hold several objects, so that the overlap
     is measured against the box alone, as COCO does for crowds and KITTI for its DontCare regions.
     """
@@ -131,9 +130,7 @@ def match(
     if regions is not None:
         if len(regions) != len(found):
             raise input_error("regions to ignore", got=f"{len(regions)} lists", expected=f"one for each of {len(found)} images")
-        ignored = [
-            flag | ((m < 0) & in_regions(box, part)) for flag, m, box, part in zip(ignored, found, boxes, regions)
-        ]
+        ignored = [flag | ((m < 0) & in_regions(box, part)) for flag, m, box, part in zip(ignored, found, boxes, regions)]
     sizes = [len(m) for m in found]
     scene = np.repeat(np.arange(len(found)), sizes)
     score = _join(scores, np.float64)
@@ -166,9 +163,7 @@ def precision_recall(matches: Matches) -> PrecisionRecall:
     return PrecisionRecall(matches.score[kept][last], hits / (last + 1), hits / matches.truths.sum())
 
 
-def average_precision(
-    matches: Matches, weights: Float[np.ndarray, "b scenes"] | None = None
-) -> Float[np.ndarray, " b"]:
+def average_precision(matches: Matches, weights: Float[np.ndarray, "b scenes"] | None = None) -> Float[np.ndarray, " b"]:
     """Area under precision against recall, all-point interpolation (Pascal VOC 2010, COCO), one value a row of weights.
 
     The precision at a recall is the largest at that or any higher recall. Detections of one score enter together.

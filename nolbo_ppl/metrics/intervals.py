@@ -18,7 +18,7 @@ CHUNK = 64
 
 
 @dataclass(frozen=True)
-class Estimate:
+class IntervalEstimate:
     """A figure with its interval; None where there is nothing to measure."""
 
     value: float | None
@@ -40,9 +40,12 @@ def resample_weights(scenes: int, resamples: int, rng: np.random.Generator) -> F
 
 
 def estimate(
-    statistic: Statistic, weights: Float[np.ndarray, "resamples scenes"], count: int, level: float = 0.95,
+    statistic: Statistic,
+    weights: Float[np.ndarray, "resamples scenes"],
+    count: int,
+    level: float = 0.95,
     pivotal: bool = False,
-) -> Estimate:
+) -> IntervalEstimate:
     """The statistic of the scenes with its bootstrap interval (Efron & Tibshirani 1993, sections 13.3 and 12.5).
 
     Scenes are resampled, not objects: objects of one image share its light, camera and occlusion. Resamples in which
@@ -62,16 +65,16 @@ def estimate(
     _check_level(level)
     value = float(statistic(np.ones((1, weights.shape[1])))[0])
     if not np.isfinite(value):
-        return Estimate(None, None, None, count)
+        return IntervalEstimate(None, None, None, count)
     parts = [statistic(weights[start : start + CHUNK]) for start in range(0, len(weights), CHUNK)]
     resampled = np.concatenate(parts)
     resampled = resampled[np.isfinite(resampled)]
     if not len(resampled):
-        return Estimate(value, None, None, count)
+        return IntervalEstimate(value, None, None, count)
     low, high = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
     if pivotal:
         low, high = max(2 * value - high, 0.0), max(2 * value - low, 0.0)
-    return Estimate(value, float(low), float(high), count)
+    return IntervalEstimate(value, float(low), float(high), count)
 
 
 def wilson_interval(successes: int | float, trials: int, level: float = 0.95) -> tuple[float, float]:
@@ -94,12 +97,12 @@ def wilson_interval(successes: int | float, trials: int, level: float = 0.95) ->
     return float(min(max(centre - half, 0.0), share)), float(max(min(centre + half, 1.0), share))
 
 
-def widened(estimate: Estimate, level: float = 0.95) -> Estimate:
+def widened(estimate: IntervalEstimate, level: float = 0.95) -> IntervalEstimate:
     """A proportion's bootstrap interval, widened to Wilson's: the bootstrap has no width at 0 and 1."""
     if estimate.value is None or estimate.low is None or estimate.high is None:
         return estimate
     low, high = wilson_interval(estimate.value * estimate.count, estimate.count, level)
-    return Estimate(estimate.value, min(low, estimate.low), max(high, estimate.high), estimate.count)
+    return IntervalEstimate(estimate.value, min(low, estimate.low), max(high, estimate.high), estimate.count)
 
 
 def _check_level(level: float) -> None:

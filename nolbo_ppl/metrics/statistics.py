@@ -43,9 +43,11 @@ def by_group(
     weight: Weights,
 ) -> Float[np.ndarray, "b groups"]:
     """The statistic of each group's objects; NaN for a group without any in a resample."""
-    return np.stack(
-        [statistic(value[group == g], weight[:, group == g]) for g in range(groups)], axis=1
-    ) if groups else np.empty((len(weight), 0))
+    return (
+        np.stack([statistic(value[group == g], weight[:, group == g]) for g in range(groups)], axis=1)
+        if groups
+        else np.empty((len(weight), 0))
+    )
 
 
 def mean_of_defined(value: Float[np.ndarray, "b groups"]) -> Float[np.ndarray, " b"]:

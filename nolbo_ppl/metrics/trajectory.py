@@ -36,8 +36,14 @@ def summarise(errors: Float[np.ndarray, " n"]) -> ErrorSummary:
     """Statistics of non-negative errors."""
     e = np.asarray(errors, dtype=np.float64)
     return ErrorSummary(
-        rmse=float(np.sqrt(np.mean(e**2))), mean=float(e.mean()), median=float(np.median(e)), std=float(e.std()),
-        min=float(e.min()), max=float(e.max()), count=len(e), errors=e,
+        rmse=float(np.sqrt(np.mean(e**2))),
+        mean=float(e.mean()),
+        median=float(np.median(e)),
+        std=float(e.std()),
+        min=float(e.min()),
+        max=float(e.max()),
+        count=len(e),
+        errors=e,
     )
 
 
@@ -70,8 +76,10 @@ def _validated(T_estimate: np.ndarray, T_truth: np.ndarray) -> tuple[np.ndarray,
             raise input_error(f"{name} holds values that are not finite")
     if len(T_estimate) != len(T_truth) or len(T_truth) == 0:
         raise input_error(
-            "trajectories do not match row by row", got=f"{len(T_estimate)} estimated poses",
-            expected=f"{len(T_truth)} as in the truth, at least one", do="pass rows of the same instants",
+            "trajectories do not match row by row",
+            got=f"{len(T_estimate)} estimated poses",
+            expected=f"{len(T_truth)} as in the truth, at least one",
+            do="pass rows of the same instants",
         )
     return T_estimate, T_truth
 
@@ -112,7 +120,9 @@ def absolute_trajectory_error(
 
 
 def relative_pose_error(
-    T_estimate: Float[np.ndarray, "n 4 4"], T_truth: Float[np.ndarray, "n 4 4"], delta: int = 1,
+    T_estimate: Float[np.ndarray, "n 4 4"],
+    T_truth: Float[np.ndarray, "n 4 4"],
+    delta: int = 1,
     part: Literal["translation", "rotation"] = "translation",
 ) -> ErrorSummary:
     """Error of the motion over `delta` rows, in m or rad: `(Q_i^-1 Q_i+d)^-1 (P_i^-1 P_i+d)` (Sturm et al. 2012).

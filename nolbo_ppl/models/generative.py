@@ -24,6 +24,7 @@ from pyro import poutine
 from torch import Tensor, nn
 from torch.distributions import kl_divergence
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.rotation import viewpoint_to_matrix
 from nolbo_ppl.models.distributions import (
     SinCosNormal,
@@ -66,7 +67,7 @@ def tilt_kl(truth: ViewpointNormal | ViewpointSinCos, q: dist.TorchDistribution)
     return kl_divergence(kind(loc, scale), kind(q.loc[..., 1:], q.scale[..., 1:])).sum(-1)
 
 
-class Story(nn.Module):
+class GenerativeModel(nn.Module):
     """The generative model, owner of the prior networks and of the decoder.
 
     A plain torch module whose forward makes Pyro statements: its parameters never enter Pyro's global store.
@@ -208,3 +209,6 @@ def voxel_site(logits: Float[Tensor, "n v v v"], observed: Float[Tensor, "n v v 
         return
     with pyro.plate("decoded", len(logits), dim=-1), poutine.scale(scale=scale):
         pyro.sample("voxels", dist.Bernoulli(logits=logits, validate_args=False).to_event(3), obs=observed)
+
+
+__getattr__ = renamed(__name__, {"Story": "GenerativeModel"})

@@ -56,9 +56,12 @@ def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> 
     """q(z^v | I) in the configured form: a mixture over azimuths, one mode, or the paper's factorised (sin, cos)."""
     if config.orientation == "mixture":
         return ViewpointMixture(
-            parameters.azimuth_logits, parameters.azimuth_natural, parameters.angle_loc, parameters.angle_scale,
+            parameters.azimuth_logits,
+            parameters.azimuth_natural,
+            parameters.angle_loc,
+            parameters.angle_scale,
             max_concentration=config.max_concentration,
-        )  # fmt: skip
+        )
     natural = parameters.azimuth_natural[..., 0, :]
     concentration = torch.linalg.vector_norm(natural, dim=-1).clamp(1e-3, config.max_concentration)
     loc = torch.cat((torch.atan2(natural[..., 1], natural[..., 0])[..., None], parameters.angle_loc), -1)
@@ -73,9 +76,7 @@ class Guide(nn.Module):
         super().__init__()
         self.config = config
         self.encoder = make_encoder(config)
-        self.head = RegionHead(
-            self.encoder.channels, config, self.encoder.fine_channels, self.encoder.fine_strides
-        )
+        self.head = RegionHead(self.encoder.channels, config, self.encoder.fine_channels, self.encoder.fine_strides)
         self._prior: Callable[[], LabelPrior] = lambda: prior  # owned by the story, shared here
         self.half_precision = False
         """Run encoder and head in bfloat16, everything after them in the weights' own precision."""
@@ -98,7 +99,11 @@ class Guide(nn.Module):
         return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine)
 
     def parameters_at(
-        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], look: bool = True,
+        self,
+        encoding: Encoding,
+        row: Int[Tensor, " n"],
+        region: Int[Tensor, " n"],
+        look: bool = True,
         box: Float[Tensor, "n 4"] | None = None,
     ) -> RegionParameters:
         """Posterior parameters of given regions.
@@ -192,10 +197,11 @@ class Guide(nn.Module):
                 pyro.sample(
                     "instance_latent",
                     NoisyNormal(
-                        q.shape_loc[..., latent:], q.shape_scale[..., latent:],
+                        q.shape_loc[..., latent:],
+                        q.shape_scale[..., latent:],
                         None if noise is None else noise[..., latent:],
                     ).to_event(1),
-                )  # fmt: skip
+                )
             with poutine.mask(mask=batch.has_viewpoint):
                 pyro.sample("orientation_latent", orientation_posterior(q, self.config))
             pyro.sample("box_latent", dist.Normal(q.box_loc, q.box_scale).to_event(1))

@@ -88,10 +88,14 @@ class RegionHead(nn.Module):
         else:
             last = OutputLinear(width, outputs)
             self.outputs = nn.Sequential(
-                nn.Linear(channels, width), nn.LayerNorm(width), nn.GELU(),
-                nn.Linear(width, width), nn.LayerNorm(width), nn.GELU(),
+                nn.Linear(channels, width),
+                nn.LayerNorm(width),
+                nn.GELU(),
+                nn.Linear(width, width),
+                nn.LayerNorm(width),
+                nn.GELU(),
                 last,
-            )  # fmt: skip
+            )
             nn.init.constant_(self.objectness.bias, -4.0)
             nn.init.normal_(last.weight, std=0.02)
         self.glimpse: Glimpse | None = None
@@ -105,8 +109,13 @@ class RegionHead(nn.Module):
         return raw[..., first : first + 4]
 
     def refine(
-        self, raw: Float[Tensor, "n outputs"], maps: Sequence[Tensor], row: Int[Tensor, " n"], cell: Int[Tensor, " n"],
-        columns: int, box: Float[Tensor, "n 4"] | None = None,
+        self,
+        raw: Float[Tensor, "n outputs"],
+        maps: Sequence[Tensor],
+        row: Int[Tensor, " n"],
+        cell: Int[Tensor, " n"],
+        columns: int,
+        box: Float[Tensor, "n 4"] | None = None,
     ) -> Float[Tensor, "n outputs"]:
         """Raw outputs after the second look at each region's own box, or at a given one; the box itself stays as it is.
 
@@ -150,9 +159,7 @@ class RegionHead(nn.Module):
         """Raw outputs of every predictor of each cell."""
         return self.outputs(features).unflatten(-1, self.start.shape) + self.start
 
-    def parameters_of(
-        self, raw: Float[Tensor, "*n outputs"], prior_mean: Float[Tensor, "labels d"]
-    ) -> RegionParameters:
+    def parameters_of(self, raw: Float[Tensor, "*n outputs"], prior_mean: Float[Tensor, "labels d"]) -> RegionParameters:
         """Posterior parameters of raw outputs.
 
         The mean of the shape latent is the expected prior mean under the category's probabilities plus a residual: the

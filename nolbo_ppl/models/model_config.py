@@ -102,8 +102,10 @@ class ModelConfig:
             raise input_error("azimuth_components", got=self.azimuth_components, expected="at least 1")
         if self.orientation != "mixture" and self.azimuth_components != 1:
             raise input_error(
-                f"orientation {self.orientation!r} has one azimuth mode", got=f"{self.azimuth_components} components",
-                expected="azimuth_components=1", do="modes that are never trained would answer queries",
+                f"orientation {self.orientation!r} has one azimuth mode",
+                got=f"{self.azimuth_components} components",
+                expected="azimuth_components=1",
+                do="modes that are never trained would answer queries",
             )
         if self.instances and self.latent_dim % 2:
             raise input_error("a latent split in two halves", got=self.latent_dim, expected="an even latent_dim")
@@ -111,12 +113,14 @@ class ModelConfig:
             raise input_error("a second look of darknet19", got=f"glimpse={self.glimpse}", expected="glimpse=0")
         if self.glimpse < 0 or self.glimpse_width < 4 or self.glimpse_width % 4:
             raise input_error(
-                "second look", got=f"glimpse={self.glimpse}, glimpse_width={self.glimpse_width}",
+                "second look",
+                got=f"glimpse={self.glimpse}, glimpse_width={self.glimpse_width}",
                 expected="glimpse >= 0 and glimpse_width a positive multiple of 4",
             )
         if not 1 <= self.glimpse_maps <= 3 or self.glimpse_blocks < 0:
             raise input_error(
-                "second look", got=f"glimpse_maps={self.glimpse_maps}, glimpse_blocks={self.glimpse_blocks}",
+                "second look",
+                got=f"glimpse_maps={self.glimpse_maps}, glimpse_blocks={self.glimpse_blocks}",
                 expected="1 to 3 maps, blocks >= 0",
             )
         if self.image_size % 32 or self.image_size <= 0:
@@ -125,7 +129,8 @@ class ModelConfig:
             channels = getattr(self, name)
             if 4 * 2 ** len(channels) != self.voxel_size:
                 raise input_error(
-                    f"{name} do not reach the voxel grid", got=f"{len(channels)} for {self.voxel_size}",
+                    f"{name} do not reach the voxel grid",
+                    got=f"{len(channels)} for {self.voxel_size}",
                     expected="one channel count per doubling of a 4^3 grid",
                 )
         if not 0 < self.objectness_epsilon < 0.5:
@@ -163,9 +168,7 @@ class ModelConfig:
 
 def tiny() -> ModelConfig:
     """The default for CPUs: 4.2 M parameters (3.0 M of them the image guide), 192 px, 32^3 voxels."""
-    return ModelConfig(
-        encoder_blocks=(1, 3, 4), glimpse_maps=3, glimpse_blocks=2, glimpse_detail=True, image_size=192
-    )
+    return ModelConfig(encoder_blocks=(1, 3, 4), glimpse_maps=3, glimpse_blocks=2, glimpse_detail=True, image_size=192)
 
 
 def nano() -> ModelConfig:

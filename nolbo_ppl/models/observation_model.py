@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from nolbo_ppl.models.generative import Story
+from nolbo_ppl.models.generative import GenerativeModel
 from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.shape_vae import ShapeGuide, ShapeStory
@@ -17,7 +17,7 @@ class Nolbo(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.config = config
-        self.story = Story(config)
+        self.story = GenerativeModel(config)
         self.guide = Guide(config, self.story.prior)
         self.shape_guide = ShapeGuide(config)
 

@@ -43,9 +43,7 @@ class Calibration:
             value = getattr(self, field.name)
             if field.name == "shape_correlation":
                 continue
-            if not (isinstance(value, (int, float)) and abs(value) < 1e6) or (
-                field.name != "objectness_shift" and value <= 0
-            ):
+            if not (isinstance(value, (int, float)) and abs(value) < 1e6) or (field.name != "objectness_shift" and value <= 0):
                 raise input_error(f"calibration factor {field.name}", got=value, expected="a positive finite number")
 
     def objectness(self, logit: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:

@@ -27,9 +27,7 @@ class LabelPrior(nn.Module):
         self.category_dim, self.instance_dim = config.category_dim, config.instance_dim
         self.labels = len(config.categories)
         self.category = PriorNetwork(self.labels, self.category_dim, config.prior_width)
-        self.instance = (
-            PriorNetwork(len(config.instances), self.instance_dim, config.prior_width) if config.instances else None
-        )
+        self.instance = PriorNetwork(len(config.instances), self.instance_dim, config.prior_width) if config.instances else None
         self.register_buffer("instance_category", torch.tensor(config.instance_category, dtype=torch.long), persistent=False)
 
     def category_mean(self) -> Float[Tensor, "labels dc"]:

@@ -68,9 +68,12 @@ class GlimpseBlock(nn.Module):
         last = nn.GroupNorm(4, width)
         nn.init.zeros_(last.weight)
         self.branch = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=1, bias=False), nn.GroupNorm(4, width), nn.GELU(),
-            nn.Conv2d(width, width, 3, padding=1, bias=False), last,
-        )  # fmt: skip
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            nn.GroupNorm(4, width),
+            nn.GELU(),
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            last,
+        )
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         """Add the two convolutions to the input."""
@@ -94,9 +97,13 @@ class Glimpse(nn.Module):
         width, hidden = config.glimpse_width, config.head_width
         self.look = nn.Sequential(
             nn.Conv2d(sum(channels[: config.glimpse_maps]), width, 3, padding=1, bias=False),
-            nn.GroupNorm(4, width), nn.GELU(), *(GlimpseBlock(width) for _ in range(config.glimpse_blocks)),
-            nn.Conv2d(width, width, 3, 2, 1, bias=False), nn.GroupNorm(4, width), nn.GELU(),
-        )  # fmt: skip
+            nn.GroupNorm(4, width),
+            nn.GELU(),
+            *(GlimpseBlock(width) for _ in range(config.glimpse_blocks)),
+            nn.Conv2d(width, width, 3, 2, 1, bias=False),
+            nn.GroupNorm(4, width),
+            nn.GELU(),
+        )
         self.detail = nn.Conv2d(channels[0], width, 4, 2, 1, bias=False) if config.glimpse_detail else None
         last = OutputLinear(hidden, outputs)
         nn.init.normal_(last.weight, std=0.02)

@@ -66,9 +66,7 @@ class SceneBatch:
     def to(self, dtype: torch.dtype) -> SceneBatch:
         """A copy with floating-point fields of another precision."""
         fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return SceneBatch(
-            **{k: v.to(dtype) if v is not None and v.is_floating_point() else v for k, v in fields.items()}
-        )
+        return SceneBatch(**{k: v.to(dtype) if v is not None and v.is_floating_point() else v for k, v in fields.items()})
 
     def neutral(self) -> SceneBatch:
         """A copy whose masked values are harmless: a NaN or a zero range under a mask would still reach the gradients."""
@@ -133,9 +131,7 @@ def cell_centre(cell: Int[Tensor, "*n"], columns: int, stride: int, dtype: torch
     return (torch.stack((cell % columns, cell // columns), -1).to(dtype) + 0.5) * stride
 
 
-def encode_box(
-    box: Float[Tensor, "*n 4"], cell: Int[Tensor, "*n"], columns: int, config: ModelConfig
-) -> Float[Tensor, "*n 4"]:
+def encode_box(box: Float[Tensor, "*n 4"], cell: Int[Tensor, "*n"], columns: int, config: ModelConfig) -> Float[Tensor, "*n 4"]:
     """Box in px -> latent units: centre offset from the cell and log size, in strides, through the fixed affine map."""
     centre, size = (box[..., :2] + box[..., 2:]) / 2, (box[..., 2:] - box[..., :2]).clamp_min(1e-3)
     offset = (centre - cell_centre(cell, columns, config.stride, box.dtype)) / config.stride

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from nolbo_ppl.models.distributions import NoisyNormal
-from nolbo_ppl.models.generative import Story, voxel_site
+from nolbo_ppl.models.generative import GenerativeModel, voxel_site
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.scene_batch import unpack_bits
 from nolbo_ppl.models.shape_networks import VoxelEncoder
@@ -34,7 +34,7 @@ class ShapeBatch:
 class ShapeStory(nn.Module):
     """The part of the story that makes voxels from labels; shares prior and decoder with the story of scenes."""
 
-    def __init__(self, story: Story) -> None:
+    def __init__(self, story: GenerativeModel) -> None:
         super().__init__()
         self.story = story
 
@@ -73,5 +73,3 @@ class ShapeGuide(nn.Module):
         noise = None if batch.noise is None else batch.noise[None]
         with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(loc), dim=-1):
             pyro.sample("shape_latent", NoisyNormal(loc[None], scale[None], noise).to_event(1))
-
-

@@ -82,8 +82,11 @@ def rowwise(
 
 
 def sampson(
-    R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
-    second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"],
+    R: Float[np.ndarray, "3 3"],
+    direction: Float[np.ndarray, " 3"],
+    first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
+    intrinsics: Float[np.ndarray, " 4"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 5"]]:
     """Signed Sampson residuals in px and their Jacobian by [rotation, direction] (Hartley and Zisserman 2004, eq. 11.9).
 
@@ -110,7 +113,9 @@ def sampson(
 
 
 def depths(
-    R: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
+    R: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, " 3"],
+    first: Float[np.ndarray, "m 3"],
     second: Float[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, "m 2"]:
     """Inverse depths in the earlier and the later view of points `x1 / rho1 = R x2 / rho2 + t`, in the unit of 1 / |t|.
@@ -154,8 +159,13 @@ def robust_cost(residual: Float[np.ndarray, " m"], threshold: float) -> float:
 
 
 def refine(
-    R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"], first: Float[np.ndarray, "m 3"],
-    second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"], threshold: float, iterations: int = 10,
+    R: Float[np.ndarray, "3 3"],
+    direction: Float[np.ndarray, " 3"],
+    first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
+    intrinsics: Float[np.ndarray, " 4"],
+    threshold: float,
+    iterations: int = 10,
 ) -> TwoView:
     """Iteratively reweighted Gauss-Newton on the Sampson residuals from a first guess.
 
@@ -216,7 +226,9 @@ def sampson_covariance(
 
 
 def essential_by_consensus(
-    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"],
+    first: Float[np.ndarray, "m 2"],
+    second: Float[np.ndarray, "m 2"],
+    intrinsics: Float[np.ndarray, " 4"],
     config: OdometryConfig,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None:
     """Rotation and unit translation of T_earlier_later by MAGSAC++ (Barath et al. 2020) on five points (Nister 2004).
@@ -243,8 +255,11 @@ def essential_by_consensus(
 
 
 def two_view(
-    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], intrinsics: Float[np.ndarray, " 4"],
-    config: OdometryConfig, guess: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None = None,
+    first: Float[np.ndarray, "m 2"],
+    second: Float[np.ndarray, "m 2"],
+    intrinsics: Float[np.ndarray, " 4"],
+    config: OdometryConfig,
+    guess: tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None = None,
 ) -> TwoView | None:
     """Motion between two views by RANSAC and refinement.
 

@@ -55,8 +55,12 @@ def vote(candidates: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]) ->
 
 
 def fit_ground(
-    view: TwoView, first: Float[np.ndarray, "m 3"], second: Float[np.ndarray, "m 3"],
-    intrinsics: Float[np.ndarray, " 4"], pitch: float, iterations: int = 8,
+    view: TwoView,
+    first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
+    intrinsics: Float[np.ndarray, " 4"],
+    pitch: float,
+    iterations: int = 8,
 ) -> Ground | None:
     """The ground under the earlier camera from the inliers of a step of unit length.
 
@@ -125,8 +129,9 @@ def next_length(before: LengthBelief | None, ground: Ground | None, setting: Gro
         predicted = LengthBelief(before.length, float(np.hypot(before.log_scale, setting.acceleration)))
     if ground is None:
         return predicted, False
-    measured = LengthBelief(setting.height * ground.inverse_height,
-                            float(np.hypot(ground.scale / ground.inverse_height, setting.ratio)))
+    measured = LengthBelief(
+        setting.height * ground.inverse_height, float(np.hypot(ground.scale / ground.inverse_height, setting.ratio))
+    )
     if predicted is None:
         return measured, True
     gap = np.log(measured.length / predicted.length)

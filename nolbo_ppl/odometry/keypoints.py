@@ -56,8 +56,17 @@ def detect(picture: UInt8[np.ndarray, "h w"], config: OdometryConfig) -> Feature
     if config.detector == "sift":
         extractor: cv2.Feature2D = cv2.SIFT.create(nfeatures=0, contrastThreshold=0.01, edgeThreshold=12.0, sigma=1.2)
     else:
-        extractor = cv2.ORB.create(4 * config.features, config.level_factor, config.levels, EDGE, 0, 2,
-                                   cv2.ORB_HARRIS_SCORE, PATCH, config.fast_threshold)
+        extractor = cv2.ORB.create(
+            4 * config.features,
+            config.level_factor,
+            config.levels,
+            EDGE,
+            0,
+            2,
+            cv2.ORB_HARRIS_SCORE,
+            PATCH,
+            config.fast_threshold,
+        )
     points = extractor.detect(picture, None)
     if not points:
         return Features(np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8))
@@ -95,8 +104,12 @@ def match(first: Features, second: Features, ratio: float, largest: float) -> In
 
 
 def track(
-    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], first: Float[np.ndarray, "m 2"],
-    second: Float[np.ndarray, "m 2"], window: int, largest: float,
+    before: UInt8[np.ndarray, "h w"],
+    after: UInt8[np.ndarray, "h w"],
+    first: Float[np.ndarray, "m 2"],
+    second: Float[np.ndarray, "m 2"],
+    window: int,
+    largest: float,
 ) -> tuple[Float[np.ndarray, "m 2"], Bool[np.ndarray, " m"]]:
     """Where the surroundings of each earlier corner are found in the later image, starting at its match.
 
@@ -119,7 +132,15 @@ def track(
     start = np.ascontiguousarray(first - 0.5, dtype=np.float32)[:, None]
     end = np.ascontiguousarray(second - 0.5, dtype=np.float32)[:, None]
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.01)
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, start, end.copy(), winSize=(window, window), maxLevel=0,
-                                                criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        start,
+        end.copy(),
+        winSize=(window, window),
+        maxLevel=0,
+        criteria=criteria,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
     moved = moved[:, 0].astype(np.float64) + 0.5
     return moved, (status[:, 0] > 0) & (np.linalg.norm(moved - second, axis=1) < largest)

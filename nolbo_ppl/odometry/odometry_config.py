@@ -78,8 +78,18 @@ class OdometryConfig:
     """
 
     def __post_init__(self) -> None:
-        positive = ("features", "fast_threshold", "levels", "cell", "threshold", "iterations", "inflation",
-                    "lost_rotation_scale", "lost_translation_ratio", "largest_shift")
+        positive = (
+            "features",
+            "fast_threshold",
+            "levels",
+            "cell",
+            "threshold",
+            "iterations",
+            "inflation",
+            "lost_rotation_scale",
+            "lost_translation_ratio",
+            "largest_shift",
+        )
         for name in positive:
             if not getattr(self, name) > 0:
                 raise input_error(f"odometry setting {name}", got=getattr(self, name), expected="a positive number")

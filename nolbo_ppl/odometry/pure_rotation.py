@@ -10,7 +10,9 @@ from nolbo_ppl.odometry.epipolar import GATE, LEAST_SCALE, student_weights
 
 
 def transfer_residual(
-    R: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "m 3"], second: Float[np.ndarray, "m 3"],
+    R: Float[np.ndarray, "3 3"],
+    first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
     intrinsics: Float[np.ndarray, " 4"],
 ) -> Float[np.ndarray, "m 2"]:
     """Corner of the earlier view less that of the later one turned into it, px."""
@@ -28,11 +30,13 @@ def align_rays(
 
 
 def rotation_only(
-    first: Float[np.ndarray, "m 3"], second: Float[np.ndarray, "m 3"], intrinsics: Float[np.ndarray, " 4"],
-    threshold: float, iterations: int = 10,
+    first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
+    intrinsics: Float[np.ndarray, " 4"],
+    threshold: float,
+    iterations: int = 10,
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], float]:
-    """Robust rotation between two views, its covariance (rad^2, later camera's axes), and the scale of its residuals, px.
-    """
+    """Robust rotation between two views, its covariance (rad^2, later camera's axes), and the scale of its residuals, px."""
     weight = np.ones(len(first))
     R, scale = np.eye(3), threshold
     for _ in range(iterations):
@@ -49,10 +53,12 @@ def rotation_only(
 
 
 def parallax_share(
-    R: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "m 3"], second: Float[np.ndarray, "m 3"],
-    intrinsics: Float[np.ndarray, " 4"], scale: float,
+    R: Float[np.ndarray, "3 3"],
+    first: Float[np.ndarray, "m 3"],
+    second: Float[np.ndarray, "m 3"],
+    intrinsics: Float[np.ndarray, " 4"],
+    scale: float,
 ) -> float:
     """Part of the matches that no rotation explains: residual beyond 3 standard deviations of both corners."""
     residual = np.linalg.norm(transfer_residual(R, first, second, intrinsics), axis=1)
     return float(np.mean(residual > 3.0 * np.sqrt(2.0) * max(scale, 0.2)))
-

@@ -118,8 +118,11 @@ def init(setup: VisualOdometry, image: UInt8[np.ndarray, "h w 3"]) -> OdometrySt
 
 
 def step_covariance(
-    view_covariance: Float[np.ndarray, "5 5"], R: Float[np.ndarray, "3 3"], direction: Float[np.ndarray, " 3"],
-    length: float, length_scale: float,
+    view_covariance: Float[np.ndarray, "5 5"],
+    R: Float[np.ndarray, "3 3"],
+    direction: Float[np.ndarray, " 3"],
+    length: float,
+    length_scale: float,
 ) -> Float[np.ndarray, "6 6"]:
     """Covariance of a step from that of rotation and direction, and its length's standard deviation, m.
 
@@ -165,8 +168,13 @@ def repeated_step(setup: VisualOdometry, state: OdometryState, matches: int) -> 
 
 
 def turning_step(
-    setup: VisualOdometry, state: OdometryState, R: Float[np.ndarray, "3 3"], covariance: Float[np.ndarray, "3 3"],
-    noise: float, matches: int, flags: StepFlag,
+    setup: VisualOdometry,
+    state: OdometryState,
+    R: Float[np.ndarray, "3 3"],
+    covariance: Float[np.ndarray, "3 3"],
+    noise: float,
+    matches: int,
+    flags: StepFlag,
 ) -> Step:
     """A step whose rotation alone is measured, `noise` px being the scale of its residuals.
 
@@ -205,8 +213,11 @@ def motion(
     """The step that matched corners (px, earlier and later) show, and what is known of its length."""
     config = setup.config
     if isinstance(setup.scale, KnownLengths) and state.frame >= len(setup.scale.lengths):
-        raise input_error("more frames than lengths of steps", got=f"frame {state.frame + 1}",
-                          expected=f"{len(setup.scale.lengths)} lengths for {len(setup.scale.lengths) + 1} frames")
+        raise input_error(
+            "more frames than lengths of steps",
+            got=f"frame {state.frame + 1}",
+            expected=f"{len(setup.scale.lengths)} lengths for {len(setup.scale.lengths) + 1} frames",
+        )
     if len(first) < config.least_inliers:
         return repeated_step(setup, state, len(first)), state.length
     ray_first, ray_second = rays(first, setup.intrinsics), rays(second, setup.intrinsics)
@@ -228,9 +239,7 @@ def motion(
     return scaled_step(setup, state, view, ray_first, ray_second)
 
 
-def step(
-    setup: VisualOdometry, state: OdometryState, image: UInt8[np.ndarray, "h w 3"]
-) -> tuple[OdometryState, Step]:
+def step(setup: VisualOdometry, state: OdometryState, image: UInt8[np.ndarray, "h w 3"]) -> tuple[OdometryState, Step]:
     """Take in the next frame.
 
     Raises:
@@ -239,8 +248,11 @@ def step(
     picture = grey(image)
     height, width = state.image.shape
     if picture.shape != state.image.shape:
-        raise input_error(f"frame {state.frame + 1} has another size", got=f"{picture.shape[1]} x {picture.shape[0]} px",
-                          expected=f"{width} x {height} px")
+        raise input_error(
+            f"frame {state.frame + 1} has another size",
+            got=f"{picture.shape[1]} x {picture.shape[0]} px",
+            expected=f"{width} x {height} px",
+        )
     features = detect(picture, setup.config)
     rows = match(state.features, features, setup.config.ratio, setup.config.largest_shift * float(np.hypot(height, width)))
     first, second = state.features.pixels[rows[:, 0]], features.pixels[rows[:, 1]]
@@ -259,7 +271,10 @@ def step(
 
 
 def estimate_odometry(
-    frames: FrameSource, intrinsics: Float[np.ndarray, " 4"], scale: Scale, config: OdometryConfig | None = None,
+    frames: FrameSource,
+    intrinsics: Float[np.ndarray, " 4"],
+    scale: Scale,
+    config: OdometryConfig | None = None,
     progress: bool = False,
 ) -> Odometry:
     """Visual odometry of a sequence, one frame in memory at a time.
@@ -278,8 +293,11 @@ def estimate_odometry(
     if len(frames) == 0:
         raise input_error("no frame to run odometry on")
     if isinstance(scale, KnownLengths) and len(scale.lengths) != len(frames) - 1:
-        raise input_error("lengths of steps do not match the frames", got=f"{len(scale.lengths)} lengths",
-                          expected=f"{len(frames) - 1} for {len(frames)} frames")
+        raise input_error(
+            "lengths of steps do not match the frames",
+            got=f"{len(scale.lengths)} lengths",
+            expected=f"{len(frames) - 1} for {len(frames)} frames",
+        )
     state = init(setup, frames.frame(0))
     steps: list[Step] = []
     numbers: Iterable[int] = range(1, len(frames))

@@ -55,8 +55,15 @@ def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1)
     write_drive(world, drive, workers)
     summary = run_mission(
         RunConfig(
-            images=drive / "images", intrinsics=drive / "intrinsics.json", truth=drive / "truth.txt", truth_objects=drive,
-            out=run, model=model, seed=seed, camera_height=world.camera_height, camera_pitch=math.radians(world.tilt),
+            images=drive / "images",
+            intrinsics=drive / "intrinsics.json",
+            truth=drive / "truth.txt",
+            truth_objects=drive,
+            out=run,
+            model=model,
+            seed=seed,
+            camera_height=world.camera_height,
+            camera_pitch=math.radians(world.tilt),
         )
-    )  # fmt: skip
+    )
     return DemoResult(figure_table(summary), summary, drive, run)

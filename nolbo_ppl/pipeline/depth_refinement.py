@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 CENTRAL = 0.5
 """Share of the box's width and height that is looked at: its border shows the background."""
@@ -77,9 +77,16 @@ def stereo_depth(
     block = 5
     levels = int(np.ceil(left.shape[1] / 4 / 16)) * 16
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=levels, blockSize=block, P1=24 * block**2, P2=96 * block**2, disp12MaxDiff=1,
-        uniquenessRatio=8, speckleWindowSize=60, speckleRange=2,
-    )  # fmt: skip
+        minDisparity=0,
+        numDisparities=levels,
+        blockSize=block,
+        P1=24 * block**2,
+        P2=96 * block**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=8,
+        speckleWindowSize=60,
+        speckleRange=2,
+    )
     # The leftmost columns have no partner inside the right image: matched on a widened pair they stay unknown, not wrong.
     pad = ((0, 0), (levels, 0), (0, 0))
     disparity = matcher.compute(np.pad(left, pad, mode="edge"), np.pad(right, pad, mode="edge"))[:, levels:] / 16.0
@@ -100,7 +107,9 @@ def half_extent_along_ray(
 
 
 def fuse_along_ray(
-    position: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"], measured: Float[np.ndarray, " n"],
+    position: Float[np.ndarray, "n 3"],
+    covariance: Float[np.ndarray, "n 3 3"],
+    measured: Float[np.ndarray, " n"],
     scale: Float[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """Product of the guide's Gaussian with one along the ray: `N(x; p, C) N(r' x; d, s^2)` normalised.
@@ -144,8 +153,8 @@ def front_depth(
 
 
 def refine_positions(
-    observed: Observations, depth: Float[np.ndarray, "h w"], image_size: tuple[int, int], scale: DepthScale
-) -> Observations:
+    observed: ObjectPosteriors, depth: Float[np.ndarray, "h w"], image_size: tuple[int, int], scale: DepthScale
+) -> ObjectPosteriors:
     """Positions and their covariances with the depth inside each box taken into account; other answers stay.
 
     Args:

@@ -59,7 +59,8 @@ def _colour(hexadecimal: str, alpha: float = 1.0) -> list[int]:
 
 
 def build_scene(
-    landmarks: Sequence[Mapping[str, Any]], voxels: Mapping[str, Float[np.ndarray, "n n n"]],
+    landmarks: Sequence[Mapping[str, Any]],
+    voxels: Mapping[str, Float[np.ndarray, "n n n"]],
     T_world_camera: Float[np.ndarray, "k 4 4"],
 ) -> Scene:
     """Landmarks that have voxels, as nodes of their names, and the camera's path, under a root that turns y up.
@@ -85,9 +86,14 @@ def build_scene(
         category = str(row.get("category") or "object")
         material = materials.setdefault(
             category,
-            PBRMaterial(name=category, baseColorFactor=_colour(category_colour(category, categories)), metallicFactor=0.0,
-                        roughnessFactor=0.8, doubleSided=True),
-        )  # fmt: skip
+            PBRMaterial(
+                name=category,
+                baseColorFactor=_colour(category_colour(category, categories)),
+                metallicFactor=0.0,
+                roughnessFactor=0.8,
+                doubleSided=True,
+            ),
+        )
         mesh = trimesh.Trimesh(vertices, faces, process=False, visual=trimesh.visual.TextureVisuals(material=material))
         scene.add_geometry(mesh, node_name=row["name"], geom_name=row["name"], parent_node_name="run")
     path = T_world_camera[:, :3, 3]

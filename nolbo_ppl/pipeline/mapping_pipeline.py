@@ -16,7 +16,7 @@ import numpy as np
 from nolbo_ppl.data.sequences import open_frames, write_camera
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
-from nolbo_ppl.inference.posterior.multiscale import Pyramid
+from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online
 from nolbo_ppl.inference.slam.map_files import library_versions, write_result
@@ -35,14 +35,14 @@ from nolbo_ppl.pipeline.perception import (
     observed_rows,
 )
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_inputs import Drive, estimate_or_read, keyframe_rows, open_drive
+from nolbo_ppl.pipeline.run_inputs import RunInputs, estimate_or_read, keyframe_rows, open_drive
 from nolbo_ppl.pipeline.run_summary import summarise
-from nolbo_ppl.pipeline.stage_store import Stage, run_stages
+from nolbo_ppl.pipeline.stage_store import PipelineStage, run_stages
 from nolbo_ppl.pipeline.thumbnails import best_views, write_crops
 from nolbo_ppl.viz.map_plots import draw_slam_result
 
 
-class Mission:
+class ObjectMappingPipeline:
     """A run under way: what its stages share, each part read when a stage first needs it.
 
     Args:
@@ -55,7 +55,7 @@ class Mission:
     def __init__(self, config: RunConfig) -> None:
         self.config, self.out = config, config.out
         check_folders(config)
-        self.drive: Drive = open_drive(config)
+        self.drive: RunInputs = open_drive(config)
         self.seconds: dict[str, float] = {}
         self.cpu_seconds: dict[str, float] = {}
 
@@ -119,7 +119,7 @@ class Mission:
                 {"frame": k, "image": placed(self.drive.file(i), self.out), "index": i, "time": self.drive.frames.time(i)}
                 for k, i in enumerate(used.tolist())
             ),
-        )  # fmt: skip
+        )
 
     def depth_source(self) -> DepthSource:
         """Depth of the keyframes, where there is any."""
@@ -135,10 +135,13 @@ class Mission:
         """The guide on every keyframe."""
         config = self.config
         options: dict[str, Any] = {
-            "threshold": config.threshold, "iou_threshold": config.overlap, "decode": False, "batch": config.batch,
-        }  # fmt: skip
+            "threshold": config.threshold,
+            "iou_threshold": config.overlap,
+            "decode": False,
+            "batch": config.batch,
+        }
         if len(config.sizes) > 1:
-            ask = partial(Pyramid(self.model, config.sizes).observe, **options)
+            ask = partial(MultiScalePredictor(self.model, config.sizes).observe, **options)
         else:
             ask = partial(self.model.observe, size=config.sizes[0], **options)
         rows = observed_rows(ask, self.read, self.names, self.drive.intrinsics, self.depth_source(), config.batch)
@@ -149,8 +152,8 @@ class Mission:
         config, problem = self.config, self.problem
         result: SlamResult = (solve_online if config.online else solve)(problem, self.slam_config)
         write_noise(self.out / "slam" / "noise.npz", result.state.noise)
-        draw_slam_result(self.out / "slam" / "map.png", problem.odometry, result, self.truth)
         write_result(self.out / "slam", result, Trajectory(problem.odometry), self.truth, model=self.model)
+        draw_slam_result(self.out / "slam" / "map.png", problem.odometry, result, self.truth)
 
     def map(self) -> None:
         """Landmarks' shapes in the world as one GLB."""
@@ -170,10 +173,16 @@ class Mission:
         """summary.json, and whose each observation is where the truth tells."""
         config = self.config
         summary, objects = summarise(
-            self.out, self.seconds, self.cpu_seconds, self.problem, drive=config.truth_objects,
-            model=None if config.truth_objects is None else self.model, config=self.slam_config, loop_gap=config.loop_gap,
+            self.out,
+            self.seconds,
+            self.cpu_seconds,
+            self.problem,
+            drive=config.truth_objects,
+            model=None if config.truth_objects is None else self.model,
+            config=self.slam_config,
+            loop_gap=config.loop_gap,
             seed=config.seed,
-        )  # fmt: skip
+        )
         if objects is not None:
             write_json(self.out / "objects.json", objects)
         write_json(self.out / "summary.json", summary)
@@ -184,7 +193,7 @@ class Mission:
 
         write_report(self.out)
 
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[PipelineStage]:
         """All stages in order, each with what it depends on."""
         config = self.config
         plain = json_of(config)
@@ -196,16 +205,24 @@ class Mission:
         way = of("every", "keyframe_distance", "keyframe_angle", "camera_height", "camera_pitch", "visual")
         seen = of("sizes", "threshold", "overlap", "depth", "depth_unit", "right", "baseline")
         stages = [
-            Stage("odometry", ("frames.jsonl", "intrinsics.json", "odometry.txt", "odometry_covariance.npz?", "truth.txt?"),
-                  {**inputs, **way, "images": self.drive.fingerprint()}, self.odometry),
-            Stage("observe", ("observations.jsonl",), {**seen, "model": model_digest(config.model)}, self.observe),
-            Stage("slam", ("slam",), of("slam", "online"), self.slam),
-            Stage("map", ("map.glb",), {}, self.map),
-            Stage("crops", ("crops",), {}, self.crops),
-            Stage("figures", ("summary.json", "objects.json?"),
-                  {**of("loop_gap", "seed"), "drive": drive_digest(config.truth_objects)}, self.figures),
-        ]  # fmt: skip
-        return [*stages, Stage("report", ("report.html",), {}, self.report)] if config.report else stages
+            PipelineStage(
+                "odometry",
+                ("frames.jsonl", "intrinsics.json", "odometry.txt", "odometry_covariance.npz?", "truth.txt?"),
+                {**inputs, **way, "images": self.drive.fingerprint()},
+                self.odometry,
+            ),
+            PipelineStage("observe", ("observations.jsonl",), {**seen, "model": model_digest(config.model)}, self.observe),
+            PipelineStage("slam", ("slam",), of("slam", "online"), self.slam),
+            PipelineStage("map", ("map.glb",), {}, self.map),
+            PipelineStage("crops", ("crops",), {}, self.crops),
+            PipelineStage(
+                "figures",
+                ("summary.json", "objects.json?"),
+                {**of("loop_gap", "seed"), "drive": drive_digest(config.truth_objects)},
+                self.figures,
+            ),
+        ]
+        return [*stages, PipelineStage("report", ("report.html",), {}, self.report)] if config.report else stages
 
 
 def run_mission(config: RunConfig) -> dict[str, Any]:
@@ -214,14 +231,13 @@ def run_mission(config: RunConfig) -> dict[str, Any]:
     Raises:
         NolboError: an input is missing, malformed, or does not fit the others; complete stages stay.
     """
-    mission = Mission(config)
+    mission = ObjectMappingPipeline(config)
     run_stages(config.out, mission.stages(), json_of(config), library_versions(), mission.seconds, mission.cpu_seconds)
     return read_json(config.out / "summary.json")
 
 
 def json_of(config: RunConfig) -> dict[str, Any]:
     """The options as JSON values."""
-
 
     def plain(value: Any) -> Any:
         return str(value) if isinstance(value, Path) else dict(value)
@@ -267,5 +283,8 @@ def check_folders(config: RunConfig) -> None:
     inputs |= {name: None if path is None else path.parent for name, path in files.items()}
     for name, folder in inputs.items():
         if folder is not None and folder.resolve() == out:
-            raise input_error("results would be written over the input", got=f"--out {config.out}",
-                              expected=f"another folder than that of --{name}")  # fmt: skip
+            raise input_error(
+                "results would be written over the input",
+                got=f"--out {config.out}",
+                expected=f"another folder than that of --{name}",
+            )

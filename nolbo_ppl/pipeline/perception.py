@@ -13,12 +13,12 @@ from tqdm import tqdm
 from nolbo_ppl.data.sequences import FrameSequence
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.pipeline.depth_refinement import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 STRUCTURED_LIGHT = 0.0015
 """Growth of the error of a structured light camera's depth with its square, 1/m (Khoshelham and Elberink 2012)."""
 Picture = UInt8[np.ndarray, "h w 3"]
-Observe = Callable[[Sequence[Picture], Float[np.ndarray, " 4"]], Sequence[Observations]]
+Observe = Callable[[Sequence[Picture], Float[np.ndarray, " 4"]], Sequence[ObjectPosteriors]]
 """Images of one camera and its intrinsics to what is observed in each."""
 
 
@@ -98,14 +98,19 @@ def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Pa
     if any(found):
         return found
     if len(files) <= max(index, default=-1):
-        raise input_error("pictures that belong to no image", got=f"{len(files)} files",
-                          expected="the images' names, or one each", file=folder)  # fmt: skip
+        raise input_error(
+            "pictures that belong to no image", got=f"{len(files)} files", expected="the images' names, or one each", file=folder
+        )
     return [files[i] for i in index]
 
 
 def observed_rows(
-    observe: Observe, read: Callable[[int], Picture], names: Sequence[str], intrinsics: Float[np.ndarray, " 4"],
-    depth: DepthSource, batch: int,
+    observe: Observe,
+    read: Callable[[int], Picture],
+    names: Sequence[str],
+    intrinsics: Float[np.ndarray, " 4"],
+    depth: DepthSource,
+    batch: int,
 ) -> Iterator[dict[str, Any]]:
     """Lines of `observations.jsonl`, batch by batch, with a progress bar on a terminal.
 

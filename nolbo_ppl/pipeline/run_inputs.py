@@ -28,7 +28,7 @@ Poses = Float[np.ndarray, "n 4 4"]
 
 
 @dataclass(frozen=True)
-class Drive:
+class RunInputs:
     """The input of a run."""
 
     frames: FrameSequence
@@ -59,7 +59,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class Every:
+class FrameSubset:
     """Some frames of a sequence."""
 
     frames: FrameSequence
@@ -90,7 +90,7 @@ class FoundOdometry:
         return chosen.T_world_camera, chosen.covariance if self.stated else None
 
 
-def open_drive(config: RunConfig) -> Drive:
+def open_drive(config: RunConfig) -> RunInputs:
     """Open images, camera and truth.
 
     Raises:
@@ -99,10 +99,10 @@ def open_drive(config: RunConfig) -> Drive:
     frames = open_frames(config.images)
     camera = read_camera(config.intrinsics, frames.size)
     truth = None if config.truth is None else poses_of_frames(config.truth, len(frames), frames.times, of="the images")
-    return Drive(frames, camera, np.arange(0, len(frames), config.every), truth)
+    return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth)
 
 
-def scale_of(drive: Drive, config: RunConfig) -> Scale:
+def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
     """Where visual odometry has its lengths from: a wheel, the height over the ground, or the truth.
 
     Raises:
@@ -114,8 +114,11 @@ def scale_of(drive: Drive, config: RunConfig) -> Scale:
         return KnownLengths(lengths_between(wheel_lengths(config.wheel, len(drive.frames) - 1), drive.used))
     if drive.truth is not None:
         return KnownLengths(lengths_of(drive.truth[drive.used]))
-    raise input_error("visual odometry without a scale", expected="--camera-height, --wheel or --truth",
-                      do="or give an odometry of your own with --odometry")  # fmt: skip
+    raise input_error(
+        "visual odometry without a scale",
+        expected="--camera-height, --wheel or --truth",
+        do="or give an odometry of your own with --odometry",
+    )
 
 
 def wheel_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
@@ -132,7 +135,7 @@ def lengths_between(lengths: Float[np.ndarray, " n"], used: Int[np.ndarray, " u"
     return np.diff(along[used])
 
 
-def estimate_or_read(drive: Drive, config: RunConfig) -> FoundOdometry:
+def estimate_or_read(drive: RunInputs, config: RunConfig) -> FoundOdometry:
     """The given odometry, with the covariances beside it where there are any, or visual odometry.
 
     Raises:
@@ -140,7 +143,7 @@ def estimate_or_read(drive: Drive, config: RunConfig) -> FoundOdometry:
     """
     if config.odometry is None:
         found = estimate_odometry(
-            Every(drive.frames, drive.used), drive.intrinsics, scale_of(drive, config), config.visual, progress=True
+            FrameSubset(drive.frames, drive.used), drive.intrinsics, scale_of(drive, config), config.visual, progress=True
         )
         return FoundOdometry(found, stated=True)
     frames = drive.frames

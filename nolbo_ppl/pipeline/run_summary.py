@@ -23,11 +23,11 @@ from nolbo_ppl.evaluation.sequence_scores import (
     position_figures,
     shape_figures,
 )
-from nolbo_ppl.evaluation.sequence_truth import DriveTruth, Matched, match_detections, object_shown, read_truth
+from nolbo_ppl.evaluation.sequence_truth import DriveTruth, MatchResult, match_detections, object_shown, read_truth
 from nolbo_ppl.inference.slam import NoiseModel, SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.inference.slam.map_files import trajectory_errors
 from nolbo_ppl.io.files import read_json, read_jsonl
-from nolbo_ppl.io.observations import ObservationTable, read_observations
+from nolbo_ppl.io.observations import Detections, read_observations
 from nolbo_ppl.io.trajectories import covariance_beside, read_trajectory
 from nolbo_ppl.metrics.trajectory import path_length
 from nolbo_ppl.pipeline.map_mesh import stands
@@ -41,7 +41,7 @@ ASSOCIATION_IOU = 0.3
 class RunResult:
     """What the files of a run say."""
 
-    table: ObservationTable
+    table: Detections
     """Observations."""
     box: Float[np.ndarray, "k 4"]
     """Their boxes, px."""
@@ -121,9 +121,7 @@ def oracle_figures(
     return {"oracle": oracle, "after_over_oracle": finite(after / oracle["ate"]) if oracle["ate"] > 0 else None}
 
 
-def observation_figures(
-    result: RunResult, matched: Matched, truth: DriveTruth, model: ShapeModel | None
-) -> dict[str, Any]:
+def observation_figures(result: RunResult, matched: MatchResult, truth: DriveTruth, model: ShapeModel | None) -> dict[str, Any]:
     """Detections, positions and regions against the truth."""
     true = matched_truth(matched, result.table.frame, truth)["position"]
     true[~matched.counted] = np.nan
@@ -135,8 +133,14 @@ def observation_figures(
 
 
 def truth_figures(
-    result: RunResult, problem: SlamProblem, truth: DriveTruth, loosely: Int[np.ndarray, " k"], model: ShapeModel | None,
-    config: SlamConfig, loop_gap: int, rng: np.random.Generator,
+    result: RunResult,
+    problem: SlamProblem,
+    truth: DriveTruth,
+    loosely: Int[np.ndarray, " k"],
+    model: ShapeModel | None,
+    config: SlamConfig,
+    loop_gap: int,
+    rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Everything that is held against the true objects; `loosely` is whose each observation is, for its association."""
     table = result.table
@@ -175,8 +179,16 @@ def time_figures(seconds: Mapping[str, float], cpu_seconds: Mapping[str, float],
 
 
 def summarise(
-    folder: Path, seconds: Mapping[str, float], cpu_seconds: Mapping[str, float], problem: SlamProblem, *,
-    drive: Path | None, model: ShapeModel | None, config: SlamConfig, loop_gap: int, seed: int,
+    folder: Path,
+    seconds: Mapping[str, float],
+    cpu_seconds: Mapping[str, float],
+    problem: SlamProblem,
+    *,
+    drive: Path | None,
+    model: ShapeModel | None,
+    config: SlamConfig,
+    loop_gap: int,
+    seed: int,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Everything `summary.json` holds, and `objects.json`: the true object of each observation, where there is a truth.
 
@@ -238,8 +250,12 @@ def figure_table(summary: Mapping[str, Any]) -> str:
             label = f"position error {name}: median, 90 %, m"
             rows.append((label, f"{number(band['median'], '{:.2f}')}, {number(band['p90'], '{:.2f}')} ({band['count']})"))
         cover = seen["coverage90"]
-        rows.append(("in the 90 % region: position, azimuth, latent",
-                     ", ".join(number(cover[key], "{:.2f}") for key in ("position", "orientation", "latent"))))  # fmt: skip
+        rows.append(
+            (
+                "in the 90 % region: position, azimuth, latent",
+                ", ".join(number(cover[key], "{:.2f}") for key in ("position", "orientation", "latent")),
+            )
+        )
     if summary.get("shape"):
         views = summary["shape"]["iou"]
         rows.append((f"voxel IoU from {', '.join(views)} views", ", ".join(number(value) for value in views.values())))

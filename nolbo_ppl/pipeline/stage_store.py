@@ -21,7 +21,7 @@ RECORD = "run.json"
 
 
 @dataclass(frozen=True)
-class Stage:
+class PipelineStage:
     """One step of a run."""
 
     name: str
@@ -70,12 +70,14 @@ class RunRecord:
         write_json(
             folder / RECORD,
             {
-                "configuration": dict(self.configuration), "versions": dict(self.versions),
+                "configuration": dict(self.configuration),
+                "versions": dict(self.versions),
                 "seconds": {name: round(value, 3) for name, value in self.seconds.items()},
                 "cpu_seconds": {name: round(value, 3) for name, value in self.cpu_seconds.items()},
-                "complete": list(self.fingerprints), "fingerprints": self.fingerprints,
+                "complete": list(self.fingerprints),
+                "fingerprints": self.fingerprints,
             },
-        )  # fmt: skip
+        )
 
 
 def recorded(folder: Path) -> dict[str, Any]:
@@ -86,8 +88,12 @@ def recorded(folder: Path) -> dict[str, Any]:
     """
     if not (folder / RECORD).is_file():
         if folder.is_dir() and any(folder.iterdir()):
-            raise input_error("the folder holds something else than a run", expected="a run, an empty folder, or none",
-                              do="choose another --out", file=folder)  # fmt: skip
+            raise input_error(
+                "the folder holds something else than a run",
+                expected="a run, an empty folder, or none",
+                do="choose another --out",
+                file=folder,
+            )
         return {}
     values = read_json(folder / RECORD)
     if not isinstance(values, dict) or not isinstance(values.get("fingerprints"), dict):
@@ -95,7 +101,7 @@ def recorded(folder: Path) -> dict[str, Any]:
     return values
 
 
-def fingerprints(stages: Sequence[Stage]) -> dict[str, str]:
+def fingerprints(stages: Sequence[PipelineStage]) -> dict[str, str]:
     """A digest for each stage of its settings and those of all before it."""
     found, digest = {}, hashlib.sha256()
     for stage in stages:
@@ -105,8 +111,12 @@ def fingerprints(stages: Sequence[Stage]) -> dict[str, str]:
 
 
 def run_stages(
-    folder: Path, stages: Sequence[Stage], configuration: Mapping[str, Any], versions: Mapping[str, str],
-    seconds: dict[str, float], cpu_seconds: dict[str, float],
+    folder: Path,
+    stages: Sequence[PipelineStage],
+    configuration: Mapping[str, Any],
+    versions: Mapping[str, str],
+    seconds: dict[str, float],
+    cpu_seconds: dict[str, float],
 ) -> RunRecord:
     """Run what is not there yet, in order; an interrupted stage leaves nothing, and complete ones before it stay.
 

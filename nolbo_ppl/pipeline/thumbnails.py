@@ -30,9 +30,7 @@ class Crop:
     """Weight times objectness times the box's side."""
 
 
-def best_views(
-    observations: Sequence[Mapping[str, Any]], associations: Sequence[Mapping[str, Any]]
-) -> dict[str, Crop]:
+def best_views(observations: Sequence[Mapping[str, Any]], associations: Sequence[Mapping[str, Any]]) -> dict[str, Crop]:
     """For each landmark the detection with the largest weight x objectness x side of its box.
 
     Args:

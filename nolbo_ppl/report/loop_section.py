@@ -78,8 +78,10 @@ def loop_scores(run: RunFolder) -> dict[str, float | None] | None:
     """Precision and recall of the loop pairs: computed where the true objects are known, else as the run's summary has them."""
     stated = run.summary.get("loops")
     if isinstance(stated, dict) and "precision" in stated:
-        return {key: stated.get(name) for key, name in (
-            ("precision", "precision"), ("recall", "recall"), ("found", "found_pairs"), ("true", "true_pairs"))}
+        return {
+            key: stated.get(name)
+            for key, name in (("precision", "precision"), ("recall", "recall"), ("found", "found_pairs"), ("true", "true_pairs"))
+        }
     label, found = object_labels(run), run.associations
     if label is None or found is None or found.frame is None:
         return None

@@ -32,14 +32,27 @@ def build_page(run: RunFolder, title: str | None = None) -> str:
     header = element("header", kicker + element("h1", escape(title)) + headline(run) + warnings(run))
     conventions = "Lengths in m, angles as stated. Poses are T_world_camera; camera x right, y down, z forward."
     frame_note = element("p", conventions, class_="note")
-    return "\n".join([
-        "<!doctype html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        element("title", escape(f"{title} – nolbo")), f"<style>{style}</style>", "</head>", "<body>",
-        element("nav", "".join(links) + switch), element("main", header + "".join(parts) + frame_note),
-        element("div", "", id="tip", role="status", hidden="hidden"), f"<script>{script}</script>", "</body>", "</html>", "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "<!doctype html>",
+            '<html lang="en">',
+            "<head>",
+            '<meta charset="utf-8">',
+            f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            element("title", escape(f"{title} – nolbo")),
+            f"<style>{style}</style>",
+            "</head>",
+            "<body>",
+            element("nav", "".join(links) + switch),
+            element("main", header + "".join(parts) + frame_note),
+            element("div", "", id="tip", role="status", hidden="hidden"),
+            f"<script>{script}</script>",
+            "</body>",
+            "</html>",
+            "",
+        ]
+    )
 
 
 def write_report(

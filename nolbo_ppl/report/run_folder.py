@@ -102,8 +102,9 @@ class RunFolder:
             known = f"{name}/variance" in archive.files
             variance = archive[f"{name}/variance"].astype(np.float64) if known else mean * (1 - mean)
         if mean.ndim != 3 or len(set(mean.shape)) != 1 or variance.shape != mean.shape:
-            raise input_error("voxels of a landmark", got=f"{name}: {mean.shape}, {variance.shape}",
-                              expected="[n, n, n] both", file=path)
+            raise input_error(
+                "voxels of a landmark", got=f"{name}: {mean.shape}, {variance.shape}", expected="[n, n, n] both", file=path
+            )
         return mean, variance
 
     def crop(self, name: str) -> Path | None:
@@ -143,8 +144,10 @@ def _iterations(path: Path, count: int) -> Iterations | None:
         T = archive["T_world_camera"].astype(np.float64)
         if T.ndim != 4 or T.shape[1:] != (count, 4, 4):
             raise input_error("`T_world_camera` of the iterations", got=T.shape, expected=f"[i, {count}, 4, 4]", file=path)
-        landmarks = tuple(archive[f"landmarks_{i}"].astype(np.float64).reshape(-1, 3)
-                          if f"landmarks_{i}" in archive.files else np.zeros((0, 3)) for i in range(len(T)))
+        landmarks = tuple(
+            archive[f"landmarks_{i}"].astype(np.float64).reshape(-1, 3) if f"landmarks_{i}" in archive.files else np.zeros((0, 3))
+            for i in range(len(T))
+        )
     return Iterations(T, landmarks)
 
 
@@ -217,8 +220,12 @@ def read_run(
         raise input_error("no such folder of a run", file=path)
     slam = next((place for place in (path / "slam", path) if (place / "trajectory.txt").is_file()), None)
     if slam is None:
-        raise input_error("no result of a run in this folder", expected="trajectory.txt or slam/trajectory.txt",
-                          do="name what --out of `nolbo run` or `nolbo slam` named", file=path)
+        raise input_error(
+            "no result of a run in this folder",
+            expected="trajectory.txt or slam/trajectory.txt",
+            do="name what --out of `nolbo run` or `nolbo slam` named",
+            file=path,
+        )
 
     def place(given: str | PathLike[str] | None, name: str) -> Path | None:
         if given is not None:
@@ -234,14 +241,22 @@ def read_run(
     names = [x.name for x in landmarks]
     associations = None
     if (slam / "associations.jsonl").is_file():
-        associations = read_associations(slam / "associations.jsonl", names,
-                                         _frame_of(place(observations, "observations.jsonl")))
+        associations = read_associations(slam / "associations.jsonl", names, _frame_of(place(observations, "observations.jsonl")))
     return RunFolder(
-        path=path, slam=slam, estimate=estimate, landmarks=landmarks,
+        path=path,
+        slam=slam,
+        estimate=estimate,
+        landmarks=landmarks,
         odometry=_rows(place(odometry, "odometry.txt"), count, times, "the odometry"),
-        truth=None if truth_given is None else align(truth_given, estimate), truth_given=truth_given,
-        times=times, images=images, intrinsics=_json(path / "intrinsics.json") or None, associations=associations,
-        iterations=_iterations(slam / "iterations.npz", count), objects=_objects(path / "objects.json"),
+        truth=None if truth_given is None else align(truth_given, estimate),
+        truth_given=truth_given,
+        times=times,
+        images=images,
+        intrinsics=_json(path / "intrinsics.json") or None,
+        associations=associations,
+        iterations=_iterations(slam / "iterations.npz", count),
+        objects=_objects(path / "objects.json"),
         run=_json(path / "run.json"),
-        summary=_json(path / "summary.json") if slam != path else {}, slam_summary=_json(slam / "summary.json"),
+        summary=_json(path / "summary.json") if slam != path else {},
+        slam_summary=_json(slam / "summary.json"),
     )

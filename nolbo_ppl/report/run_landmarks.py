@@ -174,16 +174,21 @@ def read_associations(path: Path, names: Sequence[str], frame_of: dict[str, int]
         weights = row.get("landmarks", {})
         good = isinstance(weights, dict) and all(isinstance(w, (int, float)) for w in weights.values())
         if "id" not in row or not good:
-            raise input_error("not an association", got=repr(row)[:120], expected='{"id": ..., "landmarks": {...}}',
-                              file=path, line=number)
+            raise input_error(
+                "not an association", got=repr(row)[:120], expected='{"id": ..., "landmarks": {...}}', file=path, line=number
+            )
         rows.append(row)
     frame = None
     if frame_of is not None and all(str(row["id"]) in frame_of for row in rows):
         frame = np.array([frame_of[str(row["id"])] for row in rows], dtype=np.int64)
         order = np.argsort(frame, kind="stable")
         rows, frame = [rows[k] for k in order], frame[order]
-    found = [(k, index[str(name)], float(w)) for k, row in enumerate(rows)
-             for name, w in row.get("landmarks", {}).items() if str(name) in index]
+    found = [
+        (k, index[str(name)], float(w))
+        for k, row in enumerate(rows)
+        for name, w in row.get("landmarks", {}).items()
+        if str(name) in index
+    ]
     return RunAssociations(
         id=tuple(str(row["id"]) for row in rows),
         frame=frame,

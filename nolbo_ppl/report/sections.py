@@ -29,9 +29,11 @@ from nolbo_ppl.viz.style import MUTED, category_colour
 OPTIONS = ("images", "intrinsics", "odometry", "wheel", "truth", "truth_objects", "depth", "right", "model", "out")
 """Options of a run that name its inputs and outputs."""
 SETTINGS = (
-    ("Versions", "versions", True), ("Time by stage, s", "seconds", True), ("Noise", "noise", False),
+    ("Versions", "versions", True),
+    ("Time by stage, s", "seconds", True),
+    ("Noise", "noise", False),
     ("Configuration", "configuration", False),
-)  # fmt: skip
+)
 """What is told of how a run was made: title, key in its files, whether it is unfolded."""
 
 

@@ -53,9 +53,7 @@ def view_axes(azimuth: float, elevation: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[ca, sa, 0.0], [-se * sa, se * ca, ce], [ce * sa, -ce * ca, se]])
 
 
-def rasterise(
-    triangles: Float[np.ndarray, "f 3 3"], size: int
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+def rasterise(triangles: Float[np.ndarray, "f 3 3"], size: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """Which triangle each covered pixel shows: points spread over all triangles, the nearest of a pixel stays.
 
     Args:
@@ -82,8 +80,12 @@ def rasterise(
 
 
 def render_shape(
-    mean: Float[np.ndarray, "n n n"], variance: Float[np.ndarray, "n n n"], colour: str, size: int = 224,
-    azimuth: float = AZIMUTH, elevation: float = ELEVATION,
+    mean: Float[np.ndarray, "n n n"],
+    variance: Float[np.ndarray, "n n n"],
+    colour: str,
+    size: int = 224,
+    azimuth: float = AZIMUTH,
+    elevation: float = ELEVATION,
 ) -> tuple[Rgba, Rgba]:
     """The surface in a colour, and coloured by the standard deviation of occupancy there (0 to a fair coin's 0.5)."""
     from matplotlib import colormaps

@@ -157,5 +157,11 @@ def equal_axes(points: Float[np.ndarray, "n 2"], width: float = 980.0, heights: 
 
 def picture(axes: Axes, parts: Iterable[str], label: str, **attributes: object) -> str:
     """The whole SVG, scaled to the width it is given."""
-    return element("svg", "".join(parts), viewBox=f"0 0 {number(axes.width)} {number(axes.height)}", role="img",
-                   aria_label=label, **attributes)
+    return element(
+        "svg",
+        "".join(parts),
+        viewBox=f"0 0 {number(axes.width)} {number(axes.height)}",
+        role="img",
+        aria_label=label,
+        **attributes,
+    )

@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 WAYS: tuple[tuple[str, str, Rgb], ...] = (
-    ("odometry", "Odometry", (224, 123, 57)), ("estimate", "Estimate", (47, 111, 222)), ("truth", "Truth", (90, 96, 104)),
-)  # fmt: skip
+    ("odometry", "Odometry", (224, 123, 57)),
+    ("estimate", "Estimate", (47, 111, 222)),
+    ("truth", "Truth", (90, 96, 104)),
+)
 """Trajectories: attribute of the run, name, colour."""
 MOST_CAMERAS = 60
 """Cameras drawn along the way; the slider reaches all."""
@@ -132,20 +134,40 @@ def add_cameras(viewer: Viewer, server: ViserServer) -> None:
     run, (fov, aspect), scale = viewer.run, field_of_view(viewer.run), scene_scale(viewer.run)
     for k in np.unique(np.linspace(0, len(run) - 1, min(len(run), MOST_CAMERAS)).round().astype(int)).tolist():
         handle = server.scene.add_camera_frustum(
-            f"/cameras/{k:06d}", fov, aspect, scale=scale, color=(47, 111, 222), image=read_picture(run, k, THUMBNAIL),
-            wxyz=wxyz(run.estimate[k, :3, :3]), position=run.estimate[k, :3, 3], thickness=1.5, thickness_units="screen",
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            f"/cameras/{k:06d}",
+            fov,
+            aspect,
+            scale=scale,
+            color=(47, 111, 222),
+            image=read_picture(run, k, THUMBNAIL),
+            wxyz=wxyz(run.estimate[k, :3, :3]),
+            position=run.estimate[k, :3, 3],
+            thickness=1.5,
+            thickness_units="screen",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
         viewer.add("cameras", f"/cameras/{k:06d}", handle)
 
 
 def add_keyframe(viewer: Viewer, server: ViserServer) -> None:
     """The camera at the slider, with its picture in the scene and beside it; clients may ride along."""
     run, (fov, aspect), scale = viewer.run, field_of_view(viewer.run), scene_scale(viewer.run)
-    camera = viewer.add("keyframe", "/keyframe", server.scene.add_camera_frustum(
-        "/keyframe", fov, aspect, scale=3 * scale, color=(209, 73, 91), thickness=3.0, thickness_units="screen",
-        cast_shadow=False, receive_shadow=False,
-    ))  # fmt: skip
+    camera = viewer.add(
+        "keyframe",
+        "/keyframe",
+        server.scene.add_camera_frustum(
+            "/keyframe",
+            fov,
+            aspect,
+            scale=3 * scale,
+            color=(209, 73, 91),
+            thickness=3.0,
+            thickness_units="screen",
+            cast_shadow=False,
+            receive_shadow=False,
+        ),
+    )
     blank = np.full((8, 16, 3), 230, dtype=np.uint8)
     picture = server.gui.add_image(blank, label="Picture") if any(run.images) else None
     slider = server.gui.add_slider("Keyframe", 0, max(len(run) - 1, 1), 1, 0, disabled=len(run) < 2)
@@ -178,9 +200,13 @@ def add_iterations(viewer: Viewer, server: ViserServer) -> None:
         "/em/trajectory", segments(found.T_world_camera[-1, :, :3, 3]), (150, 80, 200), thickness=3.5, thickness_units="screen"
     )
     points = server.scene.add_point_cloud(
-        "/em/landmarks", found.landmarks[-1].astype(np.float32), (150, 80, 200), point_size=0.5 * scene_scale(viewer.run),
-        point_shape="circle", precision="float32",
-    )  # fmt: skip
+        "/em/landmarks",
+        found.landmarks[-1].astype(np.float32),
+        (150, 80, 200),
+        point_size=0.5 * scene_scale(viewer.run),
+        point_shape="circle",
+        precision="float32",
+    )
     viewer.add("em", "/em/trajectory", line)
     viewer.add("em", "/em/landmarks", points)
     slider = server.gui.add_slider("EM iteration", 0, max(len(found) - 1, 1), 1, len(found) - 1, disabled=len(found) < 2)
@@ -202,8 +228,15 @@ def add_iterations(viewer: Viewer, server: ViserServer) -> None:
 def add_switches(viewer: Viewer, server: ViserServer, hidden: tuple[str, ...]) -> None:
     """A box for every layer."""
     names = {name: shown for name, shown, _ in WAYS}
-    names |= {"cameras": "Cameras", "keyframe": "Camera of the keyframe", "objects": "Shapes", "ellipsoids": "95 % ellipsoids",
-              "labels": "Names", "em": "EM iteration", "grid": "Grid"}  # fmt: skip
+    names |= {
+        "cameras": "Cameras",
+        "keyframe": "Camera of the keyframe",
+        "objects": "Shapes",
+        "ellipsoids": "95 % ellipsoids",
+        "labels": "Names",
+        "em": "EM iteration",
+        "grid": "Grid",
+    }
     with server.gui.add_folder("Show"):
         for layer, handles in viewer.layers.items():
             box = server.gui.add_checkbox(names.get(layer, layer), layer not in hidden)
@@ -241,9 +274,15 @@ def add_grid(viewer: Viewer, server: ViserServer) -> None:
     size = 10.0 ** np.floor(np.log10(extent / 4))
     names: dict[tuple[int, int], Any] = {(0, 1): "xy", (0, 2): "xz", (1, 2): "yz"}
     handle = server.scene.add_grid(
-        "/grid", extent, extent, plane=names[run.plane], cell_size=size, section_size=5 * size, position=centre,
+        "/grid",
+        extent,
+        extent,
+        plane=names[run.plane],
+        cell_size=size,
+        section_size=5 * size,
+        position=centre,
         shadow_opacity=0.0,
-    )  # fmt: skip
+    )
     viewer.add("grid", "/grid", handle)
 
 

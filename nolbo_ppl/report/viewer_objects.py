@@ -46,15 +46,25 @@ def add_shape(server: ViserServer, name: str, run: RunFolder, landmark: RunLandm
         if len(faces):
             metres = vertices * (landmark.diagonal or NO_SIZE)
             return server.scene.add_mesh_simple(
-                name, metres.astype(np.float32), faces.astype(np.uint32), color=colour, flat_shading=False, side="double",
-                cast_shadow=False, receive_shadow=False, wxyz=quaternion, position=landmark.position,
-            )  # fmt: skip
+                name,
+                metres.astype(np.float32),
+                faces.astype(np.uint32),
+                color=colour,
+                flat_shading=False,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+                wxyz=quaternion,
+                position=landmark.position,
+            )
     if landmark.size is not None:
         size: Any = tuple(landmark.size.tolist())
-        return server.scene.add_box(name, colour, size, opacity=0.6, cast_shadow=False, receive_shadow=False, wxyz=quaternion,
-                                    position=landmark.position)  # fmt: skip
-    return server.scene.add_icosphere(name, 0.15 * NO_SIZE, colour, subdivisions=2, cast_shadow=False, receive_shadow=False,
-                                      position=landmark.position)  # fmt: skip
+        return server.scene.add_box(
+            name, colour, size, opacity=0.6, cast_shadow=False, receive_shadow=False, wxyz=quaternion, position=landmark.position
+        )
+    return server.scene.add_icosphere(
+        name, 0.15 * NO_SIZE, colour, subdivisions=2, cast_shadow=False, receive_shadow=False, position=landmark.position
+    )
 
 
 def label_of(landmark: RunLandmark) -> str:
@@ -84,9 +94,16 @@ def add_objects(add: Callable[[str, str, Any], Any], run: RunFolder, server: Vis
         if landmark.position_covariance is not None:
             radii, R = ellipsoid(landmark.position_covariance)
             handle = server.scene.add_icosphere(
-                f"/ellipsoids/{k}", 1.0, rgb(colour_of(run, landmark)), subdivisions=3, scale=tuple(radii.tolist()),
-                opacity=0.22, wxyz=matrix_to_quaternion(R)[[3, 0, 1, 2]], position=landmark.position, cast_shadow=False,
+                f"/ellipsoids/{k}",
+                1.0,
+                rgb(colour_of(run, landmark)),
+                subdivisions=3,
+                scale=tuple(radii.tolist()),
+                opacity=0.22,
+                wxyz=matrix_to_quaternion(R)[[3, 0, 1, 2]],
+                position=landmark.position,
+                cast_shadow=False,
                 receive_shadow=False,
-            )  # fmt: skip
+            )
             add("ellipsoids", f"/ellipsoids/{k}", handle)
         add("labels", f"/labels/{k}", server.scene.add_label(f"/labels/{k}", label_of(landmark), position=landmark.position))

@@ -60,8 +60,15 @@ def heat_map(run: RunFolder) -> str:
     first = np.floor(np.arange(grid.shape[1]) * step).astype(int)
     frames = None if found.frame is None else found.frame[first].tolist()
     height = int(np.clip(len(names) * 9, 180, 620))
-    image = element("img", src=data_uri(pixels), alt="Association weights", style=f"height:{height}px", class_="heat",
-                    data_rows=json.dumps(names), data_columns=json.dumps({"first": first.tolist(), "frame": frames}))
+    image = element(
+        "img",
+        src=data_uri(pixels),
+        alt="Association weights",
+        style=f"height:{height}px",
+        class_="heat",
+        data_rows=json.dumps(names),
+        data_columns=json.dumps({"first": first.tolist(), "frame": frames}),
+    )
     body = image.replace("/>", ">") + _frame_ticks(found, grid.shape[1])
     side = element("div", escape(f"{len(order)} landmarks, by first detection; then new, background"), class_="heat-side")
     return element("div", side + element("div", body, class_="heat-body"), class_="heat-map", tabindex=0)

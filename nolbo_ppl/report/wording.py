@@ -28,9 +28,11 @@ UNITS = {
 }
 """Figures whose name alone would not say what they are."""
 TITLES = {
-    "map": "Map against the truth", "loops": "Loop pairs", "shape": "Shapes",
+    "map": "Map against the truth",
+    "loops": "Loop pairs",
+    "shape": "Shapes",
     "observation_figures": "Observations against the truth",
-}  # fmt: skip
+}
 """Parts of a summary whose name alone would not say what they are."""
 SETTINGS = ("configuration", "versions", "iterations", "warnings", "noise", "fingerprints", "complete")
 """Parts of a summary that are not figures."""

@@ -1,6 +1,5 @@
 """Observations of objects as SLAM takes them: one table of arrays, NaN where a field is missing, checked before use."""
 
-
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 
 MAXIMUM_DISTANCE = 1e5
@@ -17,7 +17,7 @@ MAXIMUM_DISTANCE = 1e5
 
 
 @dataclass(frozen=True)
-class ObservationTable:
+class Detections:
     """Detections of objects in camera frames; NaN where a field is missing. Rows keep the order of the file."""
 
     frame: Int[np.ndarray, " n"]
@@ -80,27 +80,53 @@ class ObservationTable:
         """Rows with a latent."""
         return np.isfinite(self.latent).all(axis=1) & (self.latent_dim > 0)
 
-    def select(self, rows: np.ndarray) -> ObservationTable:
+    def select(self, rows: np.ndarray) -> Detections:
         """The given rows (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]
         return replace(
-            self, **{name: getattr(self, name)[index] for name in ARRAYS},
-            category=tuple(self.category[i] for i in index), id=tuple(self.id[i] for i in index),
+            self,
+            **{name: getattr(self, name)[index] for name in ARRAYS},
+            category=tuple(self.category[i] for i in index),
+            id=tuple(self.id[i] for i in index),
         )
 
 
 ARRAYS = (
-    "frame", "position", "position_covariance", "rotation", "rotation_scale", "latent", "latent_scale", "objectness",
-    "size", "symmetry", "mode_weight", "mode_rotation", "mode_std",
+    "frame",
+    "position",
+    "position_covariance",
+    "rotation",
+    "rotation_scale",
+    "latent",
+    "latent_scale",
+    "objectness",
+    "size",
+    "symmetry",
+    "mode_weight",
+    "mode_rotation",
+    "mode_std",
 )
 
 
 def make_table(
-    frame: Any, position: Any, *, position_covariance: Any = None, position_scale: Any = None, rotation: Any = None,
-    rotation_scale: Any = None, latent: Any = None, latent_scale: Any = None, objectness: Any = None,
-    category: Iterable[str | None] | None = None, size: Any = None, symmetry: Any = None,
-    id: Iterable[str] | None = None, mode_weight: Any = None, mode_rotation: Any = None, mode_std: Any = None,
-) -> ObservationTable:
+    frame: Any,
+    position: Any,
+    *,
+    position_covariance: Any = None,
+    position_scale: Any = None,
+    rotation: Any = None,
+    rotation_scale: Any = None,
+    latent: Any = None,
+    latent_scale: Any = None,
+    objectness: Any = None,
+    category: Iterable[str | None] | None = None,
+    size: Any = None,
+    symmetry: Any = None,
+    id: Iterable[str] | None = None,
+    mode_weight: Any = None,
+    mode_rotation: Any = None,
+    mode_std: Any = None,
+) -> Detections:
     """Build a table from numpy arrays; everything but frame and position is optional, scalars are broadcast.
 
     Args:
@@ -138,16 +164,18 @@ def make_table(
         position_covariance = scale[:, :, None] ** 2 * np.eye(3)
     modes: dict[str, np.ndarray] = {}
     if count:
-        modes = {"mode_weight": full(mode_weight, (n, count), "mode_weight"),
-                 "mode_rotation": full(mode_rotation, (n, count, 3, 3), "mode_rotation"),
-                 "mode_std": full(mode_std, (n, count), "mode_std")}
+        modes = {
+            "mode_weight": full(mode_weight, (n, count), "mode_weight"),
+            "mode_rotation": full(mode_rotation, (n, count, 3, 3), "mode_rotation"),
+            "mode_std": full(mode_std, (n, count), "mode_std"),
+        }
         if rotation is None:
             rotation, rotation_scale = heaviest_mode(**modes)
     categories = tuple(category) if category is not None else (None,) * n
     ids = tuple(id) if id is not None else tuple(str(i) for i in range(n))
     if len(categories) != n or len(ids) != n:
         raise input_error("category or id has the wrong length", got=(len(categories), len(ids)), expected=n)
-    return ObservationTable(
+    return Detections(
         frame=frame,
         position=full(position, (n, 3), "position").reshape(n, 3),
         position_covariance=full(position_covariance, (n, 3, 3), "position_covariance"),
@@ -173,31 +201,34 @@ def heaviest_mode(
     return (np.where(none[:, None, None], np.nan, mode_rotation[row, best]), np.where(none, np.nan, mode_std[row, best]))
 
 
-def with_modes(table: ObservationTable, count: int) -> ObservationTable:
+def with_modes(table: Detections, count: int) -> Detections:
     """The same table with room for `count` modes an orientation."""
     more = count - table.modes
     if more <= 0:
         return table
     n = len(table)
     return replace(
-        table, mode_weight=np.concatenate([table.mode_weight, np.zeros((n, more))], axis=1),
+        table,
+        mode_weight=np.concatenate([table.mode_weight, np.zeros((n, more))], axis=1),
         mode_rotation=np.concatenate([table.mode_rotation, np.tile(np.eye(3), (n, more, 1, 1))], axis=1),
         mode_std=np.concatenate([table.mode_std, np.ones((n, more))], axis=1),
     )
 
 
-def concatenate(tables: list[ObservationTable]) -> ObservationTable:
+def concatenate(tables: list[Detections]) -> Detections:
     """Stack tables of one latent dimension."""
     count = max(table.modes for table in tables)
     tables = [with_modes(table, count) for table in tables]
     first = tables[0]
     return replace(
-        first, **{name: np.concatenate([getattr(t, name) for t in tables]) for name in ARRAYS},
-        category=sum((t.category for t in tables), ()), id=sum((t.id for t in tables), ()),
+        first,
+        **{name: np.concatenate([getattr(t, name) for t in tables]) for name in ARRAYS},
+        category=sum((t.category for t in tables), ()),
+        id=sum((t.id for t in tables), ()),
     )
 
 
-def check_table(table: ObservationTable, frames: int) -> None:
+def check_table(table: Detections, frames: int) -> None:
     """Refuse what no inference can use: the first bad row is named by its id.
 
     Raises:
@@ -212,14 +243,19 @@ def check_table(table: ObservationTable, frames: int) -> None:
 
     refuse((table.frame < 0) | (table.frame >= frames), "frame out of range", table.frame, f"0 to {frames - 1}")
     refuse(~np.isfinite(table.position).all(axis=1), "position is not finite", table.position, "3 finite numbers in m")
-    refuse(np.abs(table.position).max(axis=1, initial=0) > MAXIMUM_DISTANCE, "position out of range", table.position,
-           f"within {MAXIMUM_DISTANCE:g} m")
+    refuse(
+        np.abs(table.position).max(axis=1, initial=0) > MAXIMUM_DISTANCE,
+        "position out of range",
+        table.position,
+        f"within {MAXIMUM_DISTANCE:g} m",
+    )
     given = ~np.isnan(table.position_covariance).all(axis=(1, 2))
     covariance = np.where(given[:, None, None], table.position_covariance, np.eye(3))
     finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     refuse(~finite, "position covariance is not finite", covariance, "finite m^2")
-    symmetric = np.abs(covariance - np.swapaxes(covariance, 1, 2)).max(axis=(1, 2), initial=0) <= 1e-6 * np.abs(
-        covariance).max(axis=(1, 2), initial=0)
+    symmetric = np.abs(covariance - np.swapaxes(covariance, 1, 2)).max(axis=(1, 2), initial=0) <= 1e-6 * np.abs(covariance).max(
+        axis=(1, 2), initial=0
+    )
     refuse(~symmetric, "position covariance is not symmetric", covariance, "a symmetric matrix")
     eigenvalues = np.linalg.eigvalsh(covariance) if len(covariance) else np.ones((0, 3))
     refuse(
@@ -246,6 +282,7 @@ def check_table(table: ObservationTable, frames: int) -> None:
     bad = (~(table.mode_std > 0) | np.isinf(table.mode_std)).any(axis=1)
     refuse(bad, "mode_std is not a positive number", table.mode_std, "greater than 0")
     refuse(np.isinf(table.latent).any(axis=1), "latent is not finite", table.latent, "finite numbers")
-    refuse(
-        ~((table.objectness >= 0) & (table.objectness <= 1)), "objectness is no probability", table.objectness, "0 to 1"
-    )
+    refuse(~((table.objectness >= 0) & (table.objectness <= 1)), "objectness is no probability", table.objectness, "0 to 1")
+
+
+__getattr__ = renamed(__name__, {"ObservationTable": "Detections"})

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
 
 LEAST_CONCENTRATION = 0.1
@@ -43,7 +44,7 @@ class RotationModes:
 
 
 @dataclass(frozen=True)
-class Observations:
+class ObjectPosteriors:
     """Posteriors of the n objects of one image, best objectness first; metres, radians, the camera's frame."""
 
     categories: tuple[str, ...]
@@ -94,7 +95,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.objectness)
 
-    def __getitem__(self, index: Int[np.ndarray, " k"] | slice | list[int]) -> Observations:
+    def __getitem__(self, index: Int[np.ndarray, " k"] | slice | list[int]) -> ObjectPosteriors:
         """Some of the objects."""
         fields: dict[str, Any] = {}
         for field in dataclasses.fields(self):
@@ -104,7 +105,7 @@ class Observations:
             elif isinstance(value, ViewpointModes):
                 value = ViewpointModes(*(getattr(value, f.name)[index] for f in dataclasses.fields(value)))
             fields[field.name] = value
-        return Observations(**fields)
+        return ObjectPosteriors(**fields)
 
     @property
     def category(self) -> list[str]:
@@ -190,3 +191,6 @@ class Observations:
 
 def _rounded(values: Float[np.ndarray, " n"], digits: int) -> list[float]:
     return [round(float(v), digits) for v in values]
+
+
+__getattr__ = renamed(__name__, {"Observations": "ObjectPosteriors"})

@@ -65,9 +65,11 @@ def write_scenes(out: str | os.PathLike[str], source: SceneSource, count: int, w
     if made.is_file():
         if read_json(made) != _plain(description):
             raise input_error(
-                "the folder holds other scenes", got=out, expected="a new folder, or the same options to resume",
+                "the folder holds other scenes",
+                got=out,
+                expected="a new folder, or the same options to resume",
                 do="choose another --out or delete it",
-            )  # fmt: skip
+            )
     elif out.is_dir() and any(out.iterdir()):
         raise input_error("the folder is not empty", got=out, expected="a new folder", do="choose another --out")
     else:

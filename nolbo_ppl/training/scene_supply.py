@@ -26,7 +26,7 @@ def to_batch(arrays: Arrays) -> SceneBatch:
     return SceneBatch(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()})
 
 
-class Part:
+class SceneSubset:
     """Some scenes of a data set as a data set."""
 
     def __init__(self, scenes: Scenes, index: Int[np.ndarray, " n"]) -> None:
@@ -40,7 +40,7 @@ class Part:
         return self.scenes.batch(self.index[np.asarray(indices)])
 
 
-class Joined:
+class JoinedScenes:
     """Several data sets of one pool of shapes, one after the other."""
 
     def __init__(self, parts: Sequence[CachedScenes]) -> None:
@@ -138,9 +138,11 @@ class ShapeTable:
                 raise input_error("latents of mirrored shapes", got="a table taught one side", do="teach(model, mirrored=True)")
             row = row + mirrored[:, None] * len(self)
         return batch.replace(
-            shape_loc=self.loc[row], shape_scale=self.scale[row], has_voxels=batch.has_voxels & known,
+            shape_loc=self.loc[row],
+            shape_scale=self.scale[row],
+            has_voxels=batch.has_voxels & known,
             shape_index=torch.where(known, row, -1),
-        )  # fmt: skip
+        )
 
 
 class SceneSupply:

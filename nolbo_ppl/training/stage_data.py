@@ -21,7 +21,7 @@ from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
-from nolbo_ppl.training.scene_supply import Joined, Part, SceneSupply, ShapeTable
+from nolbo_ppl.training.scene_supply import JoinedScenes, SceneSubset, SceneSupply, ShapeTable
 from nolbo_ppl.training.stages import seeded_noise
 from nolbo_ppl.training.train_config import TrainConfig
 
@@ -66,9 +66,9 @@ class TrainingData:
             def cached(of: SceneSource | ViewSource, count: int) -> CachedScenes:
                 return write_cache(root, of, count, config.workers)
 
-            def all_of(seed: int, count: int) -> Joined:
+            def all_of(seed: int, count: int) -> JoinedScenes:
                 sources = [source(base, seed) for base in bases] + ([ViewSource(ViewConfig(size), seed)] if mixed else [])
-                return Joined([cached(one, -(-count // len(sources))) for one in sources])
+                return JoinedScenes([cached(one, -(-count // len(sources))) for one in sources])
 
             train = all_of(config.seed, config.count)
             held_out_scenes = all_of(config.seed + VALIDATION_SEED, max(LEAST_HELD_OUT, config.evaluate_scenes))
@@ -89,9 +89,7 @@ class TrainingData:
         if self.config.instance_labels:
             number, _, category = folder.shapes()
             names = tuple(folder.instances[n] for n in number)
-            self.model = dataclasses.replace(
-                self.model, instances=names, instance_category=tuple(int(c) for c in category)
-            )
+            self.model = dataclasses.replace(self.model, instances=names, instance_category=tuple(int(c) for c in category))
             others = tuple(name for name in folder.instances if name not in set(names))
             folder = SceneFolder(path, self.model.categories, names + others, size=size, symmetry=self.model.symmetry)
             known = len(names)
@@ -100,7 +98,7 @@ class TrainingData:
         self.single = folder
         if self.config.validation is None:
             cut = len(folder) - max(1, len(folder) // 10)
-            self.train, self._held_out = Part(folder, np.arange(cut)), Part(folder, np.arange(cut, len(folder)))
+            self.train, self._held_out = SceneSubset(folder, np.arange(cut)), SceneSubset(folder, np.arange(cut, len(folder)))
             self.single, self._held_out_table = self.train, self.table
         else:
             held_out_folder = SceneFolder(self.config.validation, self.model.categories, size=size, symmetry=self.model.symmetry)
@@ -122,10 +120,18 @@ class TrainingData:
 
             return shapes()
         supply = SceneSupply(
-            self.single if stage == "single" else self.train, self.table, config.batch,
-            3 * config.seed + (1 if stage == "single" else 2), latent,
-            self.augmentation, self.model.image_size, config.sizes, len(self.model.instances), self.rank, self.world,
-        )  # fmt: skip
+            self.single if stage == "single" else self.train,
+            self.table,
+            config.batch,
+            3 * config.seed + (1 if stage == "single" else 2),
+            latent,
+            self.augmentation,
+            self.model.image_size,
+            config.sizes,
+            len(self.model.instances),
+            self.rank,
+            self.world,
+        )
 
         def scenes() -> Iterator[SceneBatch]:
             step = start
@@ -138,8 +144,9 @@ class TrainingData:
     def validation(self, count: int | None) -> Iterator[SceneBatch]:
         """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
         known = len(self.model.instances)
-        supply = SceneSupply(self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, size=self.model.image_size,
-                             known_instances=known)
+        supply = SceneSupply(
+            self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, size=self.model.image_size, known_instances=known
+        )
         total = len(self._held_out) if count is None else min(count, len(self._held_out))
         for first in range(0, total, 64):
             batch = supply.prepared(np.arange(first, min(first + 64, total)))

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from nolbo_ppl.inference import svi as optimisation
-from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, ElboResult, SceneElbo, SceneLoss
+from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, ElboResult, SceneELBO, SceneLoss
 from nolbo_ppl.inference.svi import OptimisationConfig, OptimisationState
 from nolbo_ppl.models.normalisation import set_joint
 from nolbo_ppl.models.observation_model import Nolbo
@@ -23,7 +23,7 @@ OBJECTIVES: dict[str, Mapping[str, float]] = {"inclusive": INCLUSIVE, "elbo": PU
 
 
 @dataclass(frozen=True)
-class Stage:
+class TrainingStage:
     """One stage: what is trained, on which terms, for how long."""
 
     name: str
@@ -41,7 +41,7 @@ class Stage:
 class ShapeLoss(nn.Module):
     """Bound of the shape autoencoder as one module."""
 
-    def __init__(self, model: Nolbo, elbo: SceneElbo) -> None:
+    def __init__(self, model: Nolbo, elbo: SceneELBO) -> None:
         super().__init__()
         self.story, self.guide, self.elbo = model.shape_story, model.shape_guide, elbo
 
@@ -62,19 +62,19 @@ class StageRun:
             every step: gradients and statistics of the joint batch, which costs far more exchange.
     """
 
-    def __init__(self, model: Nolbo, stage: Stage, half_precision: bool = False, average_every: int = 1) -> None:
+    def __init__(self, model: Nolbo, stage: TrainingStage, half_precision: bool = False, average_every: int = 1) -> None:
         self.model, self.stage, self.average_every = model, stage, average_every
         self._frozen: bool | None = None
         model.requires_grad_(True)
         model.set_half_precision(half_precision)
         if stage.name == "shapes":
             model.guide.requires_grad_(False)
-            module: nn.Module = ShapeLoss(model, SceneElbo(stage.weights))
+            module: nn.Module = ShapeLoss(model, SceneELBO(stage.weights))
         else:
             model.shape_guide.requires_grad_(False)
             if stage.freeze >= stage.optimisation.steps:
                 model.story.requires_grad_(False)
-            module = SceneLoss(model.story, model.guide, SceneElbo(stage.weights))
+            module = SceneLoss(model.story, model.guide, SceneELBO(stage.weights))
         together = distributed.is_available() and distributed.is_initialized()
         self._local = together and average_every > 1
         set_joint(model, not self._local)
@@ -129,7 +129,7 @@ def scene_weights(objective: str, changes: Mapping[str, float] | None = None) ->
     return {name: weight for name, weight in weights.items() if weight}
 
 
-def shorten(stage: Stage, steps: int) -> Stage:
+def shorten(stage: TrainingStage, steps: int) -> TrainingStage:
     """The same stage with another number of steps, its freeze in proportion."""
     freeze = round(stage.freeze * steps / max(stage.optimisation.steps, 1))
     return replace(stage, optimisation=replace(stage.optimisation, steps=steps), freeze=freeze)

@@ -15,13 +15,11 @@ from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.svi import OptimisationConfig
 from nolbo_ppl.models.model_config import PRESETS, ModelConfig
 from nolbo_ppl.training.net2net import grown_config
-from nolbo_ppl.training.stages import Stage, scene_weights
+from nolbo_ppl.training.stages import TrainingStage, scene_weights
 
 DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
 """Where rendered scenes are kept between runs."""
-FREE_FIELDS = (
-    "out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every"
-)
+FREE_FIELDS = ("out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every")
 """Fields a resumed run may change: they do not touch what is learnt."""
 OPTIONAL_FIELDS = ("categories", "symmetry", "grow")
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
@@ -123,14 +121,23 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         at_least_one = (
-            "batch", "shape_batch", "log_every", "evaluate_every", "checkpoint_every", "count", "workers", "average_every"
-        )  # fmt: skip
+            "batch",
+            "shape_batch",
+            "log_every",
+            "evaluate_every",
+            "checkpoint_every",
+            "count",
+            "workers",
+            "average_every",
+        )
         for name in at_least_one:
             if getattr(self, name) < 1:
                 raise input_error(name, got=getattr(self, name), expected="at least 1")
         if self.checkpoint_every % self.average_every:
             raise input_error(
-                "checkpoint_every", got=self.checkpoint_every, expected=f"a multiple of average_every, {self.average_every}",
+                "checkpoint_every",
+                got=self.checkpoint_every,
+                expected=f"a multiple of average_every, {self.average_every}",
                 do="a run goes on exactly only from where the weights of all processes were averaged",
             )
         if not 0 <= self.freeze <= 1:
@@ -144,11 +151,17 @@ class TrainConfig:
         if self.validation is not None and self.scenes is None:
             raise input_error("held-out scenes without training scenes", do="give --scenes too")
         if self.categories and self.scenes is None:
-            raise input_error("own categories", got="generated scenes, which show the twelve of `nolbo_ppl.categories`",
-                              do="give --scenes with labels of these names")
+            raise input_error(
+                "own categories",
+                got="generated scenes, which show the twelve of `nolbo_ppl.categories`",
+                do="give --scenes with labels of these names",
+            )
         if self.symmetry and len(self.symmetry) != len(self.categories):
-            raise input_error("symmetry", got=f"{len(self.symmetry)} for {len(self.categories)} categories",
-                              expected="one for each of --categories")
+            raise input_error(
+                "symmetry",
+                got=f"{len(self.symmetry)} for {len(self.categories)} categories",
+                expected="one for each of --categories",
+            )
         if any(order < 0 for order in self.symmetry):
             raise input_error("symmetry", got=self.symmetry, expected="1 (none), n (n-fold) or 0 (free) for each category")
 
@@ -158,7 +171,8 @@ class TrainConfig:
             config = load(self.initial).config
             if self.orientation not in (None, config.orientation) or self.latent_dim not in (None, config.latent_dim):
                 raise input_error(
-                    "initial weights of another form", got=f"orientation {config.orientation}, {config.latent_dim} dimensions",
+                    "initial weights of another form",
+                    got=f"orientation {config.orientation}, {config.latent_dim} dimensions",
                     do="leave --orientation and --latent-dim out",
                 )
             if self.categories not in ((), config.categories) or self.symmetry not in ((), config.symmetry):
@@ -187,23 +201,23 @@ class TrainConfig:
         """Declared symmetry of each of `categories`."""
         return self.symmetry or tuple(CATEGORY_SYMMETRY.get(name, 1) for name in self.categories)
 
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[TrainingStage]:
         """The stages that have steps."""
         weights = scene_weights(self.objective, self.weights)
         images = OptimisationConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
         stages = [
-            Stage(
+            TrainingStage(
                 "shapes",
                 OptimisationConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
                 SHAPE_STAGE,
             ),
-            Stage(
+            TrainingStage(
                 "single",
                 dataclasses.replace(images, steps=self.single_steps, decay=0.0, warmup=min(100, self.single_steps)),
                 weights,
                 freeze=self.single_steps,
             ),
-            Stage(
+            TrainingStage(
                 "scenes",
                 dataclasses.replace(images, steps=self.scene_steps, warmup=min(100, self.scene_steps)),
                 weights,

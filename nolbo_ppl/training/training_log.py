@@ -13,7 +13,7 @@ from nolbo_ppl.inference.svi import StepInfo
 from nolbo_ppl.io.files import atomic_path, read_jsonl, write_json
 from nolbo_ppl.io.tensors import load_tensors, save_tensors
 from nolbo_ppl.models.observation_model import Nolbo
-from nolbo_ppl.training.stages import Stage, StageRun
+from nolbo_ppl.training.stages import StageRun, TrainingStage
 from nolbo_ppl.training.train_config import TrainConfig
 
 
@@ -32,7 +32,7 @@ class Journal:
 
                 self._board = SummaryWriter(str(config.out / "tensorboard"))
 
-    def resume(self, model: Nolbo, stages: Sequence[Stage]) -> tuple[int, dict[str, Any] | None, int]:
+    def resume(self, model: Nolbo, stages: Sequence[TrainingStage]) -> tuple[int, dict[str, Any] | None, int]:
         """Stage to go on with, the tensors of its state if it was under way, and its step.
 
         Raises:
@@ -50,8 +50,10 @@ class Journal:
         if meta.get("identity") != identity:
             differing = sorted(k for k in identity if identity[k] != meta.get("identity", {}).get(k))
             raise input_error(
-                "the checkpoint belongs to another configuration", got=f"differing fields {differing}",
-                file=self.file, do="choose another --out, or repeat the run's own options",
+                "the checkpoint belongs to another configuration",
+                got=f"differing fields {differing}",
+                file=self.file,
+                do="choose another --out, or repeat the run's own options",
             )
         number, at_step = int(meta["stage"]), int(meta["step"])
         self._cut(number, at_step, stages)
@@ -59,7 +61,7 @@ class Journal:
         model.load_state_dict(optimisation.module_tensors(tensors) if at_step else tensors)
         return number, tensors if at_step else None, at_step
 
-    def _cut(self, number: int, at_step: int, stages: Sequence[Stage]) -> None:
+    def _cut(self, number: int, at_step: int, stages: Sequence[TrainingStage]) -> None:
         """Drop the rows of metrics that were written after the checkpoint: they will be written again."""
         if self.rank or not self.path.is_file():
             return
@@ -75,10 +77,15 @@ class Journal:
             return
         terms = {f"terms/{name}": round(value / scenes, 5) for name, value in info.terms.items()}
         row = {
-            "stage": stage, "step": info.step + 1, "loss": round(info.loss, 5), **terms,
-            "gradient_norm": round(info.gradient_norm, 4), "learning_rate": info.learning_rate,
-            "seconds": round(seconds, 2), "waited": round(waited, 3),
-        }  # fmt: skip
+            "stage": stage,
+            "step": info.step + 1,
+            "loss": round(info.loss, 5),
+            **terms,
+            "gradient_norm": round(info.gradient_norm, 4),
+            "learning_rate": info.learning_rate,
+            "seconds": round(seconds, 2),
+            "waited": round(waited, 3),
+        }
         self.write(row)
 
     def write(self, row: dict[str, Any]) -> None:

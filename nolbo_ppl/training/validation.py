@@ -9,7 +9,7 @@ import torch
 
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
-from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SceneElbo
+from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SceneELBO
 from nolbo_ppl.models.guide import ObservedScene, orientation_posterior
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch, decode_box
@@ -34,7 +34,7 @@ def held_out(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
         scene = model.guide.observe(batch)
         scenes += len(batch.image)
         for prefix, weights in (("bound", PURE_BOUND), ("inclusive", INCLUSIVE)):
-            terms = SceneElbo(weights).evaluate(model.story, model.guide, scene, decode=decode).terms
+            terms = SceneELBO(weights).evaluate(model.story, model.guide, scene, decode=decode).terms
             for name, value in terms.items():
                 key = f"{prefix}/{name.removesuffix('_inclusive')}"
                 sums[key] = sums.get(key, 0.0) + float(value)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.evaluation.measure import SceneTruth
 from nolbo_ppl.metrics.detection import Matches
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import show_part
 from nolbo_ppl.viz.style import MUTED, category_colour, new_figure, plain, save, styled
 
@@ -35,7 +35,7 @@ class Scenes(Protocol):
 class Model(Protocol):
     """What the pictures need of a model (`nolbo_ppl.inference.posterior.predictor.ObservationModel`)."""
 
-    def observe(self, images: Any, intrinsics: Any, *, threshold: float, decode: bool) -> list[Observations]:
+    def observe(self, images: Any, intrinsics: Any, *, threshold: float, decode: bool) -> list[ObjectPosteriors]:
         """Posterior of every object of each image."""
 
 
@@ -89,7 +89,7 @@ def write_detections(found: Matches, scenes: Scenes, model: Model, path: str | P
     return figure
 
 
-def _draw(axes: Axes, scene: SceneTruth, answer: Observations) -> None:
+def _draw(axes: Axes, scene: SceneTruth, answer: ObjectPosteriors) -> None:
     """One scene."""
     height, width = scene.image.shape[:2]
     show_part(axes, scene.image, (0, width), (0, height))
@@ -102,10 +102,16 @@ def _draw(axes: Axes, scene: SceneTruth, answer: Observations) -> None:
         colour = category_colour(answer.categories[label], answer.categories)
         _rectangle(axes, box, edgecolor=colour, linewidth=1.6, zorder=4)
         axes.text(
-            np.clip(box[0], 0, width), np.clip(box[1], 0, height), f"{answer.categories[label]} {answer.objectness[i]:.2f}",
-            fontsize=5.5, color="white", va="bottom", zorder=6, clip_on=True,
+            np.clip(box[0], 0, width),
+            np.clip(box[1], 0, height),
+            f"{answer.categories[label]} {answer.objectness[i]:.2f}",
+            fontsize=5.5,
+            color="white",
+            va="bottom",
+            zorder=6,
+            clip_on=True,
             bbox={"boxstyle": "square,pad=0.15", "facecolor": colour, "alpha": 0.9, "linewidth": 0},
-        )  # fmt: skip
+        )
 
 
 def _rectangle(axes: Axes, box: Float[np.ndarray, " 4"], **style: Any) -> None:

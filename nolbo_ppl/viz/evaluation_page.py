@@ -83,9 +83,13 @@ def write_page(values: Mapping[str, Any], pictures: Sequence[Path], path: str | 
     parts = [
         f"<h1>Evaluation of {escape(str(configuration['model']))}</h1>",
         f"<p>{values['scenes']} scenes ({escape(source)}), {values['objects']} objects that count. Intervals are 95 %.</p>",
-        "<h2>Figures</h2>", _figures(values), "<h2>By category</h2>", _rows("category", values["by_category"]),
-        "<h2>By difficulty</h2>", _rows("objects with", values["by_difficulty"]),
-    ]  # fmt: skip
+        "<h2>Figures</h2>",
+        _figures(values),
+        "<h2>By category</h2>",
+        _rows("category", values["by_category"]),
+        "<h2>By difficulty</h2>",
+        _rows("objects with", values["by_difficulty"]),
+    ]
     if values.get("retrieval"):
         parts += ["<h2>The same instance, by category</h2>", _rows("category", values["retrieval"])]
     for name in [*(n for n in CAPTIONS if n in by_name), *(n for n in by_name if n not in CAPTIONS)]:

@@ -33,8 +33,12 @@ REGIONS = {
 
 
 def write_plots(
-    objects: ObjectRecords, detections: DetectionRecords, categories: Sequence[str], symmetry: Sequence[int],
-    out: str | PathLike[str], retrieval: RetrievalRecords | None = None,
+    objects: ObjectRecords,
+    detections: DetectionRecords,
+    categories: Sequence[str],
+    symmetry: Sequence[int],
+    out: str | PathLike[str],
+    retrieval: RetrievalRecords | None = None,
 ) -> list[Path]:
     """Write every plot as a PNG into a folder and return their paths."""
     figures = {
@@ -109,9 +113,17 @@ def _diagram(axes: Axes, diagram: Reliability, title: str) -> None:
     frequency, count = diagram.frequency[used], diagram.count[used]
     limits = np.array([wilson_interval(float(f * n), int(n)) for f, n in zip(frequency, count)]).reshape(-1, 2)
     axes.errorbar(
-        diagram.confidence[used], frequency, np.abs(limits.T - frequency), fmt="o", color="#2f6fde",
-        markersize=4.5, elinewidth=1.0, capsize=2, zorder=3, label="frequency, 95 %",
-    )  # fmt: skip
+        diagram.confidence[used],
+        frequency,
+        np.abs(limits.T - frequency),
+        fmt="o",
+        color="#2f6fde",
+        markersize=4.5,
+        elinewidth=1.0,
+        capsize=2,
+        zorder=3,
+        label="frequency, 95 %",
+    )
     error = np.nansum(np.abs(diagram.frequency - diagram.confidence) * diagram.count) / max(diagram.count.sum(), 1)
     axes.set(xlim=(0, 1), ylim=(0, 1.03), xlabel="stated probability", ylabel="frequency")
     axes.set_title(f"{title}: ECE {error:.3f}")
@@ -195,7 +207,10 @@ def _cumulative(axes: Axes, error: Float[np.ndarray, " n"]) -> None:
 
 
 def _by_category(
-    axes: Axes, objects: ObjectRecords, error: Float[np.ndarray, " n"], categories: Sequence[str],
+    axes: Axes,
+    objects: ObjectRecords,
+    error: Float[np.ndarray, " n"],
+    categories: Sequence[str],
     symmetry: Sequence[int],
 ) -> None:
     """Boxes of the errors of each category: median, middle half, 5 to 95 %."""
@@ -203,9 +218,14 @@ def _by_category(
         own = error[(objects.category == k) & np.isfinite(error)]
         if len(own):
             box = axes.boxplot(
-                np.maximum(own, 0.3), positions=[k], widths=0.6, whis=(5, 95), showfliers=False, patch_artist=True,
+                np.maximum(own, 0.3),
+                positions=[k],
+                widths=0.6,
+                whis=(5, 95),
+                showfliers=False,
+                patch_artist=True,
                 medianprops={"color": INK, "linewidth": 1.4},
-            )  # fmt: skip
+            )
             box["boxes"][0].set(facecolor=category_colour(name, tuple(categories)), alpha=0.65, linewidth=0.7)
     names = [name if order == 1 else f"{name} *" for name, order in zip(categories, symmetry)]
     axes.set_xticks(np.arange(len(categories)), names, rotation=40, ha="right")

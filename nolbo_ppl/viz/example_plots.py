@@ -12,7 +12,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.evaluation.measure import SceneTruth
 from nolbo_ppl.evaluation.records import ObjectRecords
 from nolbo_ppl.geometry.voxels import unpack_voxels
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import draw_frame, show_part
 from nolbo_ppl.viz.shape_plots import draw_shape
 from nolbo_ppl.viz.style import MUTED, TRUTH, category_colour, new_figure, plain, save, styled
@@ -38,7 +38,7 @@ class Scenes(Protocol):
 class Model(Protocol):
     """What examples need of a model (`nolbo_ppl.inference.posterior.predictor.ObservationModel`)."""
 
-    def observe_boxes(self, images: Any, intrinsics: Any, boxes: Any) -> list[Observations]:
+    def observe_boxes(self, images: Any, intrinsics: Any, boxes: Any) -> list[ObjectPosteriors]:
         """Posterior of the region responsible for each given box."""
 
 
@@ -117,9 +117,15 @@ def _draw_example(
         length = 0.7 * half * float(truth.position[slot, 2] / truth.intrinsics[:2].mean())
         draw_frame(axes, answer.R_camera_object[0], truth.position[slot], length, truth.intrinsics)
         draw_frame(
-            axes, truth.R_camera_object[slot], truth.position[slot], length, truth.intrinsics, colours=TRUE_AXES,
-            width=1.1, dashed=True,
-        )  # fmt: skip
+            axes,
+            truth.R_camera_object[slot],
+            truth.position[slot],
+            length,
+            truth.intrinsics,
+            colours=TRUE_AXES,
+            width=1.1,
+            dashed=True,
+        )
     plain(axes)
     label = int(objects.category[row])
     true = categories[label] if label >= 0 else "unlabelled"

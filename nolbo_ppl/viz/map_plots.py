@@ -20,9 +20,15 @@ def principal_plane(points: Float[np.ndarray, "n 3"]) -> tuple[int, int]:
 
 
 def draw_map(
-    path: str | PathLike[str], odometry: Float[np.ndarray, "n 4 4"], estimate: Float[np.ndarray, "n 4 4"], *,
-    truth: Float[np.ndarray, "n 4 4"] | None = None, landmarks: Float[np.ndarray, "m 3"] | None = None,
-    covariance: Float[np.ndarray, "m 3 3"] | None = None, names: list[str] | None = None, title: str = "",
+    path: str | PathLike[str],
+    odometry: Float[np.ndarray, "n 4 4"],
+    estimate: Float[np.ndarray, "n 4 4"],
+    *,
+    truth: Float[np.ndarray, "n 4 4"] | None = None,
+    landmarks: Float[np.ndarray, "m 3"] | None = None,
+    covariance: Float[np.ndarray, "m 3 3"] | None = None,
+    names: list[str] | None = None,
+    title: str = "",
 ) -> None:
     """Write a PNG of odometry, estimate, truth (already aligned) and landmarks with 95 % ellipses, atomically."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -33,8 +39,11 @@ def draw_map(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     i, j = principal_plane(estimate[:, :3, 3])
-    for label, T, colour, width, dashes in (("odometry", odometry, "0.6", 1.0, "-"), ("truth", truth, "k", 1.0, "--"),
-                                            ("estimate", estimate, "tab:blue", 1.5, "-")):
+    for label, T, colour, width, dashes in (
+        ("odometry", odometry, "0.6", 1.0, "-"),
+        ("truth", truth, "k", 1.0, "--"),
+        ("estimate", estimate, "tab:blue", 1.5, "-"),
+    ):
         if T is not None:
             axes.plot(T[:, i, 3], T[:, j, 3], label=label, color=colour, linewidth=width, linestyle=dashes)
     if landmarks is not None and len(landmarks):
@@ -43,8 +52,11 @@ def draw_map(
             values, vectors = np.linalg.eigh(covariance[k][np.ix_([i, j], [i, j])])  # type: ignore[index]
             width, height = 2 * np.sqrt(5.991 * np.maximum(values, 0))
             angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-            axes.add_patch(Ellipse((landmarks[k, i], landmarks[k, j]), width, height, angle=angle, fill=False,
-                                   color="tab:red", alpha=0.3, lw=0.6))
+            axes.add_patch(
+                Ellipse(
+                    (landmarks[k, i], landmarks[k, j]), width, height, angle=angle, fill=False, color="tab:red", alpha=0.3, lw=0.6
+                )
+            )
         if names is not None and len(names) <= 60:
             for k, name in enumerate(names):
                 axes.annotate(name, (landmarks[k, i], landmarks[k, j]), fontsize=6, color="tab:red")

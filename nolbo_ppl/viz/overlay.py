@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.style import AXIS_COLOURS, category_colour, plain
 
 if TYPE_CHECKING:
@@ -31,14 +31,18 @@ def project(points: Float[np.ndarray, "n 3"], intrinsics: Float[np.ndarray, " 4"
     return points[:, :2] / points[:, 2:] * intrinsics[:2] + intrinsics[2:]
 
 
-def object_axes(observations: Observations, index: int) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+def object_axes(observations: ObjectPosteriors, index: int) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
     """R_camera_object and position of one object."""
     return observations.R_camera_object[index], observations.position[index]
 
 
 def draw_box3d(
-    axes: Axes, R_camera_object: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"],
-    size: Float[np.ndarray, " 3"], intrinsics: Float[np.ndarray, " 4"], colour: str,
+    axes: Axes,
+    R_camera_object: Float[np.ndarray, "3 3"],
+    position: Float[np.ndarray, " 3"],
+    size: Float[np.ndarray, " 3"],
+    intrinsics: Float[np.ndarray, " 4"],
+    colour: str,
 ) -> None:
     """The object's 3D box as lines, its front face filled faintly; nothing when a corner is behind the camera."""
     pixels = project((_CORNERS * size) @ R_camera_object.T + position, intrinsics)
@@ -50,8 +54,14 @@ def draw_box3d(
 
 
 def draw_frame(
-    axes: Axes, R_camera_object: Float[np.ndarray, "3 3"], position: Float[np.ndarray, " 3"], length: float,
-    intrinsics: Float[np.ndarray, " 4"], *, colours: tuple[str, str, str] = AXIS_COLOURS, width: float = 1.6,
+    axes: Axes,
+    R_camera_object: Float[np.ndarray, "3 3"],
+    position: Float[np.ndarray, " 3"],
+    length: float,
+    intrinsics: Float[np.ndarray, " 4"],
+    *,
+    colours: tuple[str, str, str] = AXIS_COLOURS,
+    width: float = 1.6,
     dashed: bool = False,
 ) -> None:
     """The object's axes right (x), front (-y) and up (z) as lines of that length in m; the front one is an arrow."""
@@ -62,18 +72,28 @@ def draw_frame(
     for k in (0, 2, 1):
         style = "-|>,head_length=0.45,head_width=0.2" if k == 1 else "-"
         line = axes.annotate(
-            "", xy=pixels[k + 1], xytext=pixels[0], zorder=5, annotation_clip=False,
+            "",
+            xy=pixels[k + 1],
+            xytext=pixels[0],
+            zorder=5,
+            annotation_clip=False,
             arrowprops={
-                "arrowstyle": style, "color": colours[k], "linewidth": width * (1.25 if k == 1 else 1.0), "shrinkA": 0,
-                "shrinkB": 0, "linestyle": (0, (2.5, 1.5)) if dashed else "-",
+                "arrowstyle": style,
+                "color": colours[k],
+                "linewidth": width * (1.25 if k == 1 else 1.0),
+                "shrinkA": 0,
+                "shrinkB": 0,
+                "linestyle": (0, (2.5, 1.5)) if dashed else "-",
             },
-        )  # fmt: skip
+        )
         assert line.arrow_patch is not None
         line.arrow_patch.set_clip_path(axes.patch)
 
 
 def pixel_ellipse(
-    position: Float[np.ndarray, " 3"], covariance: Float[np.ndarray, "3 3"], intrinsics: Float[np.ndarray, " 4"],
+    position: Float[np.ndarray, " 3"],
+    covariance: Float[np.ndarray, "3 3"],
+    intrinsics: Float[np.ndarray, " 4"],
     nodes: int = 48,
 ) -> Float[np.ndarray, "nodes 2"] | None:
     """Outline in px of the 90 % region of a position's projection, to first order; None behind the camera."""
@@ -104,9 +124,7 @@ def bearing_range_ellipse(
     return np.array([np.arctan2(x, z), 0.5 * np.log(squared)]) + _outline(jacobian @ covariance @ jacobian.T, nodes)
 
 
-def show_part(
-    axes: Axes, image: UInt8[np.ndarray, "h w 3"], x: tuple[float, float], y: tuple[float, float]
-) -> None:
+def show_part(axes: Axes, image: UInt8[np.ndarray, "h w 3"], x: tuple[float, float], y: tuple[float, float]) -> None:
     """Show the part of an image between two columns and two rows (px), nothing beyond its borders."""
     height, width = image.shape[:2]
     x0, x1 = max(int(np.floor(x[0])), 0), min(int(np.ceil(x[1])), width)
@@ -117,7 +135,7 @@ def show_part(
 
 
 def draw_overlay(
-    axes: Axes, image: UInt8[np.ndarray, "h w 3"], observations: Observations, intrinsics: Float[np.ndarray, " 4"]
+    axes: Axes, image: UInt8[np.ndarray, "h w 3"], observations: ObjectPosteriors, intrinsics: Float[np.ndarray, " 4"]
 ) -> None:
     """Image with boxes, projected 3D boxes, axes, position ellipses and labels."""
     from matplotlib.patches import Rectangle
@@ -127,9 +145,7 @@ def draw_overlay(
     for i, category in enumerate(observations.category):
         colour = category_colour(category, observations.categories)
         x0, y0, x1, y1 = observations.box[i]
-        axes.add_patch(
-            Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.8, zorder=4)
-        )
+        axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.8, zorder=4))
         R_camera_object, position = object_axes(observations, i)
         draw_box3d(axes, R_camera_object, position, observations.size[i], intrinsics, colour)
         draw_frame(axes, R_camera_object, position, 0.4 * observations.diagonal[i], intrinsics)
@@ -138,13 +154,20 @@ def draw_overlay(
             axes.plot(*outline.T, color="white", linewidth=1.0, zorder=4.5)
     if not len(observations):
         axes.text(
-            0.5, 0.5, "no object found", transform=axes.transAxes, ha="center", va="center", fontsize=12, color="white",
+            0.5,
+            0.5,
+            "no object found",
+            transform=axes.transAxes,
+            ha="center",
+            va="center",
+            fontsize=12,
+            color="white",
             bbox={"boxstyle": "round,pad=0.4", "facecolor": "black", "alpha": 0.55, "linewidth": 0},
-        )  # fmt: skip
+        )
     place_labels(axes, observations)
 
 
-def place_labels(axes: Axes, observations: Observations) -> list[Text]:
+def place_labels(axes: Axes, observations: ObjectPosteriors) -> list[Text]:
     """Write number, category, its probability and objectness at each box, where no other label is.
 
     A label goes above its box, below it, or inside, whichever comes first that is inside the image and free; when none
@@ -160,10 +183,16 @@ def place_labels(axes: Axes, observations: Observations) -> list[Text]:
         colour = category_colour(category, observations.categories)
         label = observations.categories.index(category)
         text = axes.text(
-            0, 0, f"{i + 1} {category} {observations.class_posterior[i, label]:.2f} · {observations.objectness[i]:.2f}",
-            fontsize=7, color="white", zorder=10, va="bottom", ha="left",
+            0,
+            0,
+            f"{i + 1} {category} {observations.class_posterior[i, label]:.2f} · {observations.objectness[i]:.2f}",
+            fontsize=7,
+            color="white",
+            zorder=10,
+            va="bottom",
+            ha="left",
             bbox={"boxstyle": "square,pad=0.22", "facecolor": colour, "alpha": 0.92, "linewidth": 0},
-        )  # fmt: skip
+        )
         texts.append(text)
         patch = text.get_bbox_patch()
         assert patch is not None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import bearing_range_ellipse
 from nolbo_ppl.viz.style import INK, MUTED, category_colour, grid, plain
 
@@ -21,7 +21,7 @@ LEAST_MODE = 0.05
 """Azimuth modes of less weight are drawn in the density but not marked."""
 
 
-def draw_classes(axes: Axes, observations: Observations, index: int) -> None:
+def draw_classes(axes: Axes, observations: ObjectPosteriors, index: int) -> None:
     """Bars of the most probable categories; a dot marks the one of maximum likelihood over the prior means."""
     posterior = observations.class_posterior[index]
     best = np.argsort(-posterior, kind="stable")[:SHOWN]
@@ -33,16 +33,19 @@ def draw_classes(axes: Axes, observations: Observations, index: int) -> None:
         text = f"{observations.categories[k]} {probability:.2f}" + (" •" if likeliest else "")
         inside = probability > 0.72
         axes.text(
-            probability - 0.03 if inside else probability + 0.03, y, text, va="center", fontsize=7,
-            ha="right" if inside else "left", color="white" if inside else INK,
-        )  # fmt: skip
+            probability - 0.03 if inside else probability + 0.03,
+            y,
+            text,
+            va="center",
+            fontsize=7,
+            ha="right" if inside else "left",
+            color="white" if inside else INK,
+        )
     axes.set(xlim=(0, 1), ylim=(SHOWN - 0.4, -0.6), yticks=[], xticks=[0, 0.5, 1])
     axes.set_title("class posterior (• likeliest)")
 
 
-def azimuth_density(
-    observations: Observations, index: int, angle: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, " k"]:
+def azimuth_density(observations: ObjectPosteriors, index: int, angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
     """Density of the azimuth posterior at angles in rad: a mixture of von Mises."""
     from scipy.special import i0e
 
@@ -52,7 +55,7 @@ def azimuth_density(
     return each @ weight
 
 
-def draw_azimuth(axes: Axes, observations: Observations, index: int, colour: str) -> None:
+def draw_azimuth(axes: Axes, observations: ObjectPosteriors, index: int, colour: str) -> None:
     """Azimuth density around the object seen from above, its front at the bottom: where the camera stands."""
     angle = np.linspace(-math.pi, math.pi, 721)
     density = azimuth_density(observations, index, angle)
@@ -75,7 +78,7 @@ def draw_azimuth(axes: Axes, observations: Observations, index: int, colour: str
     axes.set_title(f"azimuth {math.degrees(observations.viewpoint[index, 0]):.0f}°")
 
 
-def draw_position(axes: Axes, observations: Observations, index: int, colour: str) -> None:
+def draw_position(axes: Axes, observations: ObjectPosteriors, index: int, colour: str) -> None:
     """Density of the distance, with the position and its scales in words."""
     position, covariance = observations.position[index], observations.position_covariance[index]
     distance = float(np.linalg.norm(position))
@@ -102,7 +105,10 @@ def _uncertain(value: float, scale: float) -> str:
 
 
 def draw_latent(
-    axes: Axes, observations: Observations, index: int, colour: str,
+    axes: Axes,
+    observations: ObjectPosteriors,
+    index: int,
+    colour: str,
     prior_mean: Float[np.ndarray, "labels d"] | None = None,
 ) -> None:
     """Mean and scale of each dimension of the shape latent; grey bars are the prior mean of its category."""
@@ -112,9 +118,7 @@ def draw_latent(
         of_category = prior_mean[observations.categories.index(observations.category[index])]
         axes.bar(dimension, of_category, width=0.8, color="#dfe3e7", zorder=1)
     if len(mean) <= 32:
-        axes.errorbar(
-            dimension, mean, scale, fmt="o", color=colour, markersize=2.8, elinewidth=1.1, capsize=1.5, zorder=2
-        )
+        axes.errorbar(dimension, mean, scale, fmt="o", color=colour, markersize=2.8, elinewidth=1.1, capsize=1.5, zorder=2)
     else:
         axes.fill_between(dimension, mean - scale, mean + scale, color=colour, alpha=0.35, linewidth=0)
         axes.plot(dimension, mean, color=colour, linewidth=0.8)
@@ -125,7 +129,7 @@ def draw_latent(
     axes.locator_params(axis="y", nbins=5)
 
 
-def draw_range(axes: Axes, observations: Observations) -> None:
+def draw_range(axes: Axes, observations: ObjectPosteriors) -> None:
     """Where the objects are: bearing against distance (logarithmic) with 90 % regions and the way each one faces.
 
     Distances of one image may span centimetres to hundreds of metres; an arrow shows the front's direction seen from
@@ -153,7 +157,7 @@ def draw_range(axes: Axes, observations: Observations) -> None:
     axes.tick_params(axis="y", which="minor", labelsize=6.5)
 
 
-def _number_and_heading(axes: Axes, observations: Observations) -> None:
+def _number_and_heading(axes: Axes, observations: ObjectPosteriors) -> None:
     """Numbers of the objects and arrows of their fronts."""
     for i, category in enumerate(observations.category):
         colour = category_colour(category, observations.categories)
@@ -164,10 +168,21 @@ def _number_and_heading(axes: Axes, observations: Observations) -> None:
         length = np.linalg.norm(heading)
         if length > 0.2:
             axes.annotate(
-                "", xy=at, xytext=tuple(22 * heading / length), textcoords="offset points", zorder=4,
+                "",
+                xy=at,
+                xytext=tuple(22 * heading / length),
+                textcoords="offset points",
+                zorder=4,
                 arrowprops={"arrowstyle": "<|-", "color": colour, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0},
-            )  # fmt: skip
+            )
         axes.annotate(
-            str(i + 1), at, fontsize=7, color="white", ha="center", va="center", zorder=5, fontweight="bold",
+            str(i + 1),
+            at,
+            fontsize=7,
+            color="white",
+            ha="center",
+            va="center",
+            zorder=5,
+            fontweight="bold",
             bbox={"boxstyle": "circle,pad=0.18", "facecolor": colour, "linewidth": 0},
         )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import draw_box3d, draw_frame, draw_overlay, object_axes, show_part
 from nolbo_ppl.viz.panels import draw_azimuth, draw_classes, draw_latent, draw_position, draw_range
 from nolbo_ppl.viz.shape_plots import draw_shape, draw_uncertainty
@@ -32,7 +32,7 @@ TOP = 5.6
 
 def draw_observations(
     image: UInt8[np.ndarray, "h w 3"],
-    observations: Observations,
+    observations: ObjectPosteriors,
     intrinsics: Float[np.ndarray, " 4"],
     *,
     prior_mean: Float[np.ndarray, "labels d"] | None = None,
@@ -70,9 +70,15 @@ def draw_observations(
         if title:
             figure.text(0.02, 1 - 0.22 / height, title, fontsize=11, fontweight="bold", va="center")
         place = figure.add_gridspec(
-            1, 2, left=0.02, right=0.985, top=1 - head / height, bottom=1 - (head + TOP - 0.25) / height, wspace=0.12,
+            1,
+            2,
+            left=0.02,
+            right=0.985,
+            top=1 - head / height,
+            bottom=1 - (head + TOP - 0.25) / height,
+            wspace=0.12,
             width_ratios=_widths(image),
-        )  # fmt: skip
+        )
         draw_overlay(figure.add_subplot(place[0]), image, observations, intrinsics)
         _draw_legend(figure, 1 - (head + TOP - 0.1) / height)
         draw_range(figure.add_subplot(place[1]), observations)
@@ -104,8 +110,14 @@ def _draw_legend(figure: Figure, y: float) -> None:
 
 
 def _draw_row(
-    figure: Figure, top: float, height: float, image: UInt8[np.ndarray, "h w 3"], observations: Observations,
-    index: int, intrinsics: Float[np.ndarray, " 4"], prior_mean: Float[np.ndarray, "labels d"] | None,
+    figure: Figure,
+    top: float,
+    height: float,
+    image: UInt8[np.ndarray, "h w 3"],
+    observations: ObjectPosteriors,
+    index: int,
+    intrinsics: Float[np.ndarray, " 4"],
+    prior_mean: Float[np.ndarray, "labels d"] | None,
 ) -> None:
     """The distributions of one object."""
     colour = category_colour(observations.category[index], observations.categories)
@@ -116,9 +128,15 @@ def _draw_row(
     facts = f"objectness {observations.objectness[index]:.3f}     size {extents} m"
     figure.text(0.15, line, facts, fontsize=8, color=INK, va="center")
     grid: GridSpec = figure.add_gridspec(
-        1, 7, left=0.02, right=0.985, top=1 - (top + HEADER + 0.1) / height,
-        bottom=1 - (top + HEADER + ROW - 0.35) / height, wspace=0.2, width_ratios=(1.0, 1.1, 1.2, 1.1, 1.0, 1.0, 1.35),
-    )  # fmt: skip
+        1,
+        7,
+        left=0.02,
+        right=0.985,
+        top=1 - (top + HEADER + 0.1) / height,
+        bottom=1 - (top + HEADER + ROW - 0.35) / height,
+        wspace=0.2,
+        width_ratios=(1.0, 1.1, 1.2, 1.1, 1.0, 1.0, 1.35),
+    )
     _draw_closeup(figure.add_subplot(grid[0]), image, observations, index, intrinsics, colour)
     draw_classes(figure.add_subplot(grid[1]), observations, index)
     draw_azimuth(figure.add_subplot(grid[2]), observations, index, colour)
@@ -136,8 +154,12 @@ def _titled(axes: Axes, title: str) -> None:
 
 
 def _draw_closeup(
-    axes: Axes, image: UInt8[np.ndarray, "h w 3"], observations: Observations, index: int,
-    intrinsics: Float[np.ndarray, " 4"], colour: str,
+    axes: Axes,
+    image: UInt8[np.ndarray, "h w 3"],
+    observations: ObjectPosteriors,
+    index: int,
+    intrinsics: Float[np.ndarray, " 4"],
+    colour: str,
 ) -> None:
     """The object cut out of the image, with its 3D box and axes."""
     x0, y0, x1, y1 = observations.box[index]

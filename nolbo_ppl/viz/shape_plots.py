@@ -96,7 +96,10 @@ def face_values(
 
 
 def draw_shape(
-    figure: Figure, place: SubplotSpec, occupancy: Float[np.ndarray, "n n n"], colour: Any,
+    figure: Figure,
+    place: SubplotSpec,
+    occupancy: Float[np.ndarray, "n n n"],
+    colour: Any,
     viewpoint: Float[np.ndarray, " 3"],
 ) -> Any:
     """Draw the 0.5-surface of an occupancy grid from a viewpoint."""
@@ -106,7 +109,10 @@ def draw_shape(
 
 
 def draw_uncertainty(
-    figure: Figure, place: SubplotSpec, occupancy: Float[np.ndarray, "n n n"], variance: Float[np.ndarray, "n n n"],
+    figure: Figure,
+    place: SubplotSpec,
+    occupancy: Float[np.ndarray, "n n n"],
+    variance: Float[np.ndarray, "n n n"],
     viewpoint: Float[np.ndarray, " 3"],
 ) -> Any:
     """Draw the same surface coloured by the standard deviation of occupancy there, from 0 to a fair coin's 0.5."""

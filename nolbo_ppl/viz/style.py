@@ -26,20 +26,53 @@ AXIS_COLOURS = ("#d1495b", "#2e9e5b", "#2f6fde")
 """Object axes: right (x), front (-y), up (z)."""
 
 _PALETTE = (
-    "#4e79a7", "#f28e2b", "#59a14f", "#76b7b2", "#e15759", "#b07aa1", "#9c755f", "#d4a514", "#d37295", "#499894",
-    "#6b4c9a", "#79706e",
-)  # fmt: skip
+    "#4e79a7",
+    "#f28e2b",
+    "#59a14f",
+    "#76b7b2",
+    "#e15759",
+    "#b07aa1",
+    "#9c755f",
+    "#d4a514",
+    "#d37295",
+    "#499894",
+    "#6b4c9a",
+    "#79706e",
+)
 
 _RC: dict[str, Any] = {
-    "font.family": "DejaVu Sans", "font.size": 8.0, "axes.titlesize": 8.5, "axes.titleweight": "bold",
-    "axes.titlepad": 5.0, "axes.labelsize": 7.5, "axes.labelcolor": INK, "axes.edgecolor": MUTED, "text.color": INK,
-    "axes.linewidth": 0.7, "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True,
-    "axes.titlecolor": INK, "grid.color": "#d9dde1", "grid.linewidth": 0.6, "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0, "xtick.color": INK, "ytick.color": INK, "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7, "xtick.major.size": 2.5, "ytick.major.size": 2.5, "xtick.minor.size": 1.5,
-    "ytick.minor.size": 1.5, "legend.fontsize": 7.5, "legend.frameon": False, "figure.facecolor": "white",
-    "savefig.facecolor": "white", "lines.solid_capstyle": "round",
-}  # fmt: skip
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.titleweight": "bold",
+    "axes.titlepad": 5.0,
+    "axes.labelsize": 7.5,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "text.color": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.titlecolor": INK,
+    "grid.color": "#d9dde1",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.minor.size": 1.5,
+    "ytick.minor.size": 1.5,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "lines.solid_capstyle": "round",
+}
 
 
 @contextmanager

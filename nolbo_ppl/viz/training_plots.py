@@ -20,8 +20,17 @@ if TYPE_CHECKING:
 FIGURES = ("box50", "category", "acc_pi6", "azimuth_in_90")
 """Held-out shares that are drawn together."""
 _COLOURS = (
-    "#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#b07aa1", "#76b7b2", "#9c755f", "#d4a514", "#6b4c9a", "#79706e",
-)  # fmt: skip
+    "#4e79a7",
+    "#f28e2b",
+    "#59a14f",
+    "#e15759",
+    "#b07aa1",
+    "#76b7b2",
+    "#9c755f",
+    "#d4a514",
+    "#6b4c9a",
+    "#79706e",
+)
 
 
 def read_metrics(path: str | PathLike[str]) -> list[dict[str, Any]]:
@@ -62,8 +71,7 @@ def draw_training(path: str | PathLike[str], out: str | PathLike[str] | None = N
     rows = read_metrics(path)
     stages = list(dict.fromkeys(row["stage"] for row in rows))
     panels: list[tuple[str, str, list[dict[str, Any]]]] = [
-        (f"{stage}: terms of the loss, nats", "terms/", [row for row in rows if row["stage"] == stage])
-        for stage in stages
+        (f"{stage}: terms of the loss, nats", "terms/", [row for row in rows if row["stage"] == stage]) for stage in stages
     ]
     held_out = [row for row in rows if "loss" not in row]
     if held_out:

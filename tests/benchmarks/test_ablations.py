@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.elbo import SceneElbo
+from nolbo_ppl.inference.elbo import SceneELBO
 from nolbo_ppl.io.files import write_json
 
 
@@ -32,7 +32,7 @@ def test_every_variant_is_a_run_of_its_own(ablations, settings):
     for name in ablations.VARIANTS:
         config = ablations.training_config(name, settings)
         for stage in config.stages():
-            SceneElbo(stage.weights)  # names of terms are checked here
+            SceneELBO(stage.weights)  # names of terms are checked here
         identity = config.identity()
         assert all(identity != other for other in seen.values()), name
         seen[name] = identity

@@ -63,8 +63,11 @@ def test_an_unknown_option_is_refused(verb: str, capsys: pytest.CaptureFixture[s
     [(NolboError("the disc is full"), 2, "nolbo train: the disc is full"), (KeyboardInterrupt(), 130, "interrupted")],
 )
 def test_errors_end_with_a_status_and_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    raised: BaseException, status: int, message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    raised: BaseException,
+    status: int,
+    message: str,
 ) -> None:
     def fail(arguments: list[str]) -> None:
         assert arguments == ["--seed", "1"]

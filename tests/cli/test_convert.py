@@ -24,7 +24,12 @@ def test_poles_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert len(read_trajectory(tmp_path / "out" / "odometry.txt")) == 5
     assert len(read_observations(tmp_path / "out" / "observations.jsonl", frames=5)) > 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
-        "objects.json", "observations.jsonl", "odometry.txt", "source.json", "truth.txt"]
+        "objects.json",
+        "observations.jsonl",
+        "odometry.txt",
+        "source.json",
+        "truth.txt",
+    ]
 
 
 def test_missing_data_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

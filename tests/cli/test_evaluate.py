@@ -21,7 +21,7 @@ from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels, voxel_centres
 from nolbo_ppl.metrics.detection import match
 from nolbo_ppl.models.model_config import tiny
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 from nolbo_ppl.viz.example_plots import badness
 
 LABELS = len(CATEGORIES)
@@ -58,12 +58,19 @@ def made_scenes(count, seed=0, objects=4):
         viewpoints.append(viewpoint)
         scenes.append(
             SceneTruth(
-                image=rng.integers(0, 256, (64, 64, 3), dtype=np.uint8), intrinsics=CAMERA, box=box, category=category,
-                R_camera_object=egocentric(viewpoint, position), position=position, symmetry=SYMMETRY[category],
-                visibility=np.ones(objects), voxels=pack_voxels(ellipsoids(rng, objects)), diagonal=np.ones(objects),
+                image=rng.integers(0, 256, (64, 64, 3), dtype=np.uint8),
+                intrinsics=CAMERA,
+                box=box,
+                category=category,
+                R_camera_object=egocentric(viewpoint, position),
+                position=position,
+                symmetry=SYMMETRY[category],
+                visibility=np.ones(objects),
+                voxels=pack_voxels(ellipsoids(rng, objects)),
+                diagonal=np.ones(objects),
                 ignore=np.zeros((0, 4)),
             )
-        )  # fmt: skip
+        )
     return scenes, viewpoints
 
 
@@ -101,17 +108,30 @@ class Oracle:
             probability[i, [drawn, true]] = probability[i, [true, drawn]]
         likelihood = np.where(np.arange(LABELS) == scene.category[:, None], 0.0, -10.0)
         best = np.stack((mean, *tilt.T), 1)
-        return Observations(
-            categories=CATEGORIES, objectness=rng.uniform(0.1, 1, n), box=scene.box.copy(), box_scale=np.ones((n, 4)),
-            class_log_posterior=np.log(np.maximum(probability, 1e-12)), class_log_likelihood=likelihood,
-            instance_log_posterior=None, latent=teacher + latent_scale * rng.normal(size=(n, d)),
-            latent_scale=latent_scale, position=position, position_covariance=covariance,
+        return ObjectPosteriors(
+            categories=CATEGORIES,
+            objectness=rng.uniform(0.1, 1, n),
+            box=scene.box.copy(),
+            box_scale=np.ones((n, 4)),
+            class_log_posterior=np.log(np.maximum(probability, 1e-12)),
+            class_log_likelihood=likelihood,
+            instance_log_posterior=None,
+            latent=teacher + latent_scale * rng.normal(size=(n, d)),
+            latent_scale=latent_scale,
+            position=position,
+            position_covariance=covariance,
             viewpoint_modes=ViewpointModes(np.tile(weights, (n, 1)), mean[:, None] + offsets, np.full((n, 4), kappa)),
-            elevation_inplane=tilt, elevation_inplane_scale=np.full((n, 2), 0.1), viewpoint=best,
-            R_camera_object=egocentric(best, position), rotation_scale=np.full(n, 0.1),
-            diagonal=np.ones(n), diagonal_log_scale=np.full(n, 0.1), size=np.full((n, 3), 0.6), voxel_mean=None,
+            elevation_inplane=tilt,
+            elevation_inplane_scale=np.full((n, 2), 0.1),
+            viewpoint=best,
+            R_camera_object=egocentric(best, position),
+            rotation_scale=np.full(n, 0.1),
+            diagonal=np.ones(n),
+            diagonal_log_scale=np.full(n, 0.1),
+            size=np.full((n, 3), 0.6),
+            voxel_mean=None,
             voxel_variance=None,
-        )  # fmt: skip
+        )
 
     def observe(self, images, intrinsics, *, threshold, decode, batch):
         found = []
@@ -153,19 +173,25 @@ def exactly(said, scene, rng, viewpoints):
     n = len(scene.box)
     certain = np.where(np.arange(LABELS) == scene.category[:, None], 0.0, -30.0)
     return dataclasses.replace(
-        said, objectness=np.ones(n), class_log_posterior=certain, viewpoint=viewpoint, position=scene.position,
-        R_camera_object=scene.R_camera_object, elevation_inplane=viewpoint[:, 1:],
+        said,
+        objectness=np.ones(n),
+        class_log_posterior=certain,
+        viewpoint=viewpoint,
+        position=scene.position,
+        R_camera_object=scene.R_camera_object,
+        elevation_inplane=viewpoint[:, 1:],
         viewpoint_modes=ViewpointModes(np.ones((n, 1)), viewpoint[:, :1], np.full((n, 1), 200.0)),
-    )  # fmt: skip
+    )
 
 
 def exact_oracle(scenes, viewpoints, change=lambda said, scene, k: said):
     table = {scene.image.tobytes(): (v, k) for k, (scene, v) in enumerate(zip(scenes, viewpoints))}
     only = {key: v for key, (v, _) in table.items()}
     model = Oracle(
-        scenes, viewpoints,
+        scenes,
+        viewpoints,
         spoil=lambda said, scene, rng: change(exactly(said, scene, rng, only), scene, table[scene.image.tobytes()][1]),
-    )  # fmt: skip
+    )
     for scene, said in model.answers.values():
         said.latent[:] = model.shape_posterior(scene.voxels)[0]
     return model
@@ -179,8 +205,17 @@ def test_exact_answers_score_perfectly():
     scenes, viewpoints = made_scenes(24)
     result = measure(config(), exact_oracle(scenes, viewpoints), scenes)
     value = {name: one.value for name, one in result.figures.items()}
-    for name in ("ap50", "map50", "category_accuracy", "acc_pi6", "acc_pi6_all", "coverage90_orientation",
-                 "coverage90_position", "coverage90_latent", "coverage90_tilt"):  # fmt: skip
+    for name in (
+        "ap50",
+        "map50",
+        "category_accuracy",
+        "acc_pi6",
+        "acc_pi6_all",
+        "coverage90_orientation",
+        "coverage90_position",
+        "coverage90_latent",
+        "coverage90_tilt",
+    ):
         assert value[name] == 1.0, name
     assert value["med_err_deg"] == pytest.approx(0, abs=1e-6)
     assert value["ece_objectness"] == pytest.approx(0, abs=1e-12) and value["ece_class"] == pytest.approx(0, abs=1e-9)
@@ -216,9 +251,13 @@ def test_known_faults_give_known_figures():
         box = said.box.copy()
         box[3] += 400.0
         return dataclasses.replace(
-            said, viewpoint=turned, R_camera_object=egocentric(turned, scene.position), box=box,
-            class_log_likelihood=likelihood, objectness=np.array([1, 1, 1, 0.2]),
-        )  # fmt: skip
+            said,
+            viewpoint=turned,
+            R_camera_object=egocentric(turned, scene.position),
+            box=box,
+            class_log_likelihood=likelihood,
+            objectness=np.array([1, 1, 1, 0.2]),
+        )
 
     result = measure(config(), exact_oracle(scenes, viewpoints, change), scenes)
     category = np.concatenate([s.category for s in scenes])
@@ -259,9 +298,12 @@ def test_overconfidence_shows():
     def spoil(said, scene, rng):
         sharp = 4 * said.class_log_posterior
         return dataclasses.replace(
-            said, position_covariance=said.position_covariance / 16, class_log_posterior=sharp,
-            latent_scale=said.latent_scale / 2, objectness=np.sqrt(said.objectness),
-        )  # fmt: skip
+            said,
+            position_covariance=said.position_covariance / 16,
+            class_log_posterior=sharp,
+            latent_scale=said.latent_scale / 2,
+            objectness=np.sqrt(said.objectness),
+        )
 
     value = {k: v.value for k, v in measure(config(), Oracle(scenes, viewpoints, spoil=spoil), scenes).figures.items()}
     assert value["coverage90_position"] < 0.4 and value["coverage90_latent"] < 0.2 and value["ece_class"] > 0.1
@@ -377,9 +419,12 @@ def test_missing_labels_are_left_out():
     partly = []
     for scene in scenes:
         part = dataclasses.replace(
-            scene, R_camera_object=scene.R_camera_object.copy(), position=scene.position.copy(),
-            category=scene.category.copy(), voxels=scene.voxels.copy(),
-        )  # fmt: skip
+            scene,
+            R_camera_object=scene.R_camera_object.copy(),
+            position=scene.position.copy(),
+            category=scene.category.copy(),
+            voxels=scene.voxels.copy(),
+        )
         part.R_camera_object[0], part.position[1], part.category[2], part.voxels[3] = np.nan, np.nan, -1, 0
         partly.append(part)
     model = exact_oracle(scenes, viewpoints)

@@ -37,8 +37,9 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
             # Texels of a wall at this depth to pixels: 100 texels a metre, its centre on the first camera's axis.
             scale = FOCAL / (depth - at[2]) / 100.0
             shift = [SIZE / 2 - scale * 450 - FOCAL * at[0] / (depth - at[2]), SIZE / 2 - scale * 450]
-            view = cv2.warpAffine(wall, np.array([[scale, 0, shift[0]], [0, scale, shift[1]]]), (SIZE, SIZE),
-                                  flags=cv2.INTER_AREA)
+            view = cv2.warpAffine(
+                wall, np.array([[scale, 0, shift[0]], [0, scale, shift[1]]]), (SIZE, SIZE), flags=cv2.INTER_AREA
+            )
             image[rows] = view[rows]
         Image.fromarray(image.astype(np.uint8)).save(out / "images" / f"{k:03d}.png")
     (out / "intrinsics.json").write_text(json.dumps({"fx": FOCAL, "fy": FOCAL, "cx": SIZE / 2, "cy": SIZE / 2}))

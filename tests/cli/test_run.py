@@ -19,23 +19,39 @@ from nolbo_ppl.io.files import read_json
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.pipeline import mapping_pipeline as pipeline
-from nolbo_ppl.pipeline.mapping_pipeline import Mission
+from nolbo_ppl.pipeline.mapping_pipeline import ObjectMappingPipeline
 from nolbo_ppl.pipeline.run_config import RunConfig
 from tests.factories import tiny_model
 from tests.simulated_sequence import DIAGONAL, SimulatedDrive, drive  # noqa: F401
 
 FILES = {
-    "crops", "frames.jsonl", "intrinsics.json", "map.glb", "objects.json", "observations.jsonl", "odometry.txt", "run.json",
-    "slam", "summary.json", "truth.txt",
-}  # fmt: skip
+    "crops",
+    "frames.jsonl",
+    "intrinsics.json",
+    "map.glb",
+    "objects.json",
+    "observations.jsonl",
+    "odometry.txt",
+    "run.json",
+    "slam",
+    "summary.json",
+    "truth.txt",
+}
 
 
 def config_of(drive: SimulatedDrive, out: Path, **change: Any) -> RunConfig:  # noqa: F811
     folder = drive.folder
     values: dict[str, Any] = {
-        "images": folder / "images", "intrinsics": folder / "intrinsics.json", "odometry": folder / "odometry.txt",
-        "truth": folder / "truth.txt", "truth_objects": folder, "out": out, "threshold": 0.05, "report": False, **change,
-    }  # fmt: skip
+        "images": folder / "images",
+        "intrinsics": folder / "intrinsics.json",
+        "odometry": folder / "odometry.txt",
+        "truth": folder / "truth.txt",
+        "truth_objects": folder,
+        "out": out,
+        "threshold": 0.05,
+        "report": False,
+        **change,
+    }
     return RunConfig(**values)
 
 
@@ -56,12 +72,21 @@ def finished(known: SimulatedDrive, tmp_path_factory: pytest.TempPathFactory) ->
 
 def test_every_file_is_written_and_the_loop_is_closed(known: SimulatedDrive, finished: Path) -> None:
     assert {path.name for path in finished.iterdir()} == FILES
-    assert {"trajectory.txt", "landmarks.json", "associations.jsonl", "iterations.npz", "landmarks_voxels.npz", "map.png",
-            "noise.npz", "summary.json"} == {path.name for path in (finished / "slam").iterdir()}  # fmt: skip
+    assert {
+        "trajectory.txt",
+        "landmarks.json",
+        "associations.jsonl",
+        "iterations.npz",
+        "landmarks_voxels.npz",
+        "map.png",
+        "noise.npz",
+        "summary.json",
+    } == {path.name for path in (finished / "slam").iterdir()}
     summary = read_json(finished / "summary.json")
     assert summary["frames"] == 120 and summary["after"]["ate"] < 0.4 * summary["before"]["ate"]
     assert 0.5 < summary["after_over_oracle"] < 2 and summary["after_over_before"] == pytest.approx(
-        summary["after"]["ate"] / summary["before"]["ate"], abs=1e-5)  # fmt: skip
+        summary["after"]["ate"] / summary["before"]["ate"], abs=1e-5
+    )
     # At the image's border some detections are of objects that the truth just left out: they are not held to be theirs.
     assert summary["loops"]["precision"] > 0.9 and summary["loops"]["recall"] > 0.9
     chart = summary["map"]
@@ -117,9 +142,7 @@ def test_a_finished_run_is_not_done_again(known: SimulatedDrive, finished: Path,
     assert after == before and after["complete"] == ["odometry", "observe", "slam", "map", "crops", "figures"]
 
 
-def test_an_interruption_keeps_what_is_complete(
-    known: SimulatedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interruption_keeps_what_is_complete(known: SimulatedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     short = replace(config_of(known, out).slam, em_iterations=1)
     config = config_of(known, out, truth_objects=None, every=2, online=True, slam=short)
@@ -145,7 +168,7 @@ def test_an_interruption_keeps_what_is_complete(
 
 
 def test_keyframes_by_distance(known: SimulatedDrive, tmp_path: Path) -> None:
-    mission = Mission(config_of(known, tmp_path, keyframe_distance=4.0))
+    mission = ObjectMappingPipeline(config_of(known, tmp_path, keyframe_distance=4.0))
     mission.odometry()
     kept = read_trajectory(tmp_path / "odometry.txt").T_world_camera
     given = read_trajectory(known.folder / "odometry.txt").T_world_camera
@@ -161,7 +184,7 @@ def test_covariances_beside_an_odometry_come_with_it(known: SimulatedDrive, tmp_
     write_trajectory(tmp_path / "mine" / "odometry.txt", Trajectory(T))
     one = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
     np.savez(tmp_path / "mine" / "odometry_covariance.npz", covariance=np.tile(one, (119, 1, 1)))
-    mission = Mission(config_of(known, tmp_path / "run", odometry=tmp_path / "mine" / "odometry.txt", every=2))
+    mission = ObjectMappingPipeline(config_of(known, tmp_path / "run", odometry=tmp_path / "mine" / "odometry.txt", every=2))
     (tmp_path / "run").mkdir()
     mission.odometry()
     with np.load(tmp_path / "run" / "odometry_covariance.npz") as arrays:
@@ -202,12 +225,17 @@ def test_results_never_replace_the_input(known: SimulatedDrive) -> None:
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"every": 0}, "--every"), ({"threshold": 1.0}, "--threshold"), ({"sizes": ()}, "--sizes"), ({"batch": 0}, "--batch"),
-        ({"right": Path("right")}, "a stereo pair"), ({"keyframe_distance": -1.0}, "spacing of keyframes"),
+        ({"every": 0}, "--every"),
+        ({"threshold": 1.0}, "--threshold"),
+        ({"sizes": ()}, "--sizes"),
+        ({"batch": 0}, "--batch"),
+        ({"right": Path("right")}, "a stereo pair"),
+        ({"keyframe_distance": -1.0}, "spacing of keyframes"),
         ({"depth": Path("d"), "right": Path("r"), "baseline": 0.1}, "--depth and --right"),
-        ({"right": Path("r"), "baseline": -0.1}, "--baseline"), ({"camera_height": 1.0, "wheel": Path("w")}, "one source of"),
+        ({"right": Path("r"), "baseline": -0.1}, "--baseline"),
+        ({"camera_height": 1.0, "wheel": Path("w")}, "one source of"),
     ],
-)  # fmt: skip
+)
 def test_options_that_make_no_sense(change: dict[str, Any], match: str) -> None:
     with pytest.raises(InputError, match=match):
         RunConfig(images=Path("i"), intrinsics=Path("k"), out=Path("o"), **change)
@@ -217,9 +245,26 @@ def test_the_whole_way_with_a_network(drive: SimulatedDrive, tmp_path: Path, cap
     """The command itself, an untrained network in place of a trained one: whatever it says, the run ends in a report."""
     save(tmp_path / "model", tiny_model(scatter=0.1).float(), Calibration(objectness_shift=-1.5), {})
     folder = drive.folder
-    main(["--images", str(folder / "images"), "--intrinsics", str(folder / "intrinsics.json"), "--truth",
-          str(folder / "truth.txt"), "--model", str(tmp_path / "model"), "--out", str(tmp_path / "run"), "--every", "12",
-          "--sizes", "64", "--slam.em-iterations", "1"])  # fmt: skip
+    main(
+        [
+            "--images",
+            str(folder / "images"),
+            "--intrinsics",
+            str(folder / "intrinsics.json"),
+            "--truth",
+            str(folder / "truth.txt"),
+            "--model",
+            str(tmp_path / "model"),
+            "--out",
+            str(tmp_path / "run"),
+            "--every",
+            "12",
+            "--sizes",
+            "64",
+            "--slam.em-iterations",
+            "1",
+        ]
+    )
     told = capsys.readouterr().out
     assert "ATE before / after" in told and "images a second" in told
     assert {path.name for path in (tmp_path / "run").iterdir()} >= {"report.html", "summary.json", "odometry_covariance.npz"}

@@ -21,8 +21,9 @@ from tests.factories import tiny_model
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("drive")
     rng = np.random.default_rng(0)
-    drive = simulate_drive(simulate_circuit(rng, laps=2, frames_per_lap=60), rng,
-                           world=WorldConfig(objects=25, categories=4, latent_dim=4))
+    drive = simulate_drive(
+        simulate_circuit(rng, laps=2, frames_per_lap=60), rng, world=WorldConfig(objects=25, categories=4, latent_dim=4)
+    )
     times = np.arange(len(drive.truth)) * 0.1 + 100.0
     write_trajectory(out / "odometry.txt", Trajectory(drive.odometry, times, "tum"))
     write_trajectory(out / "truth.txt", Trajectory(drive.truth, times, "tum"))
@@ -43,12 +44,23 @@ def arguments(folder: Path, out: Path, **change: str) -> list[str]:
 
 def test_every_file_is_written(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save(folder / "model", tiny_model().float(), Calibration(), {})
-    main([*arguments(folder, tmp_path, truth=str(folder / "truth.txt"), model=str(folder / "model")),
-          "--config.em-iterations", "2"])
+    main(
+        [
+            *arguments(folder, tmp_path, truth=str(folder / "truth.txt"), model=str(folder / "model")),
+            "--config.em-iterations",
+            "2",
+        ]
+    )
     assert "ATE" in capsys.readouterr().out
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "associations.jsonl", "iterations.npz", "landmarks.json", "landmarks_voxels.npz", "map.png", "summary.json",
-        "trajectory.txt"]
+        "associations.jsonl",
+        "iterations.npz",
+        "landmarks.json",
+        "landmarks_voxels.npz",
+        "map.png",
+        "summary.json",
+        "trajectory.txt",
+    ]
     back = read_trajectory(tmp_path / "trajectory.txt")
     assert back.format == "tum" and len(back) == 120 and back.times is not None and back.times[0] == 100.0
     ids = [json.loads(line)["id"] for line in (folder / "observations.jsonl").read_text().splitlines()]
@@ -76,11 +88,7 @@ def test_every_file_is_written(folder: Path, tmp_path: Path, capsys: pytest.Capt
 
 def test_kitti_in_kitti_out_and_no_observations(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "none.jsonl").write_text("")
-    main(
-        arguments(
-            folder, tmp_path / "out", odometry=str(folder / "kitti.txt"), observations=str(tmp_path / "none.jsonl")
-        )
-    )
+    main(arguments(folder, tmp_path / "out", odometry=str(folder / "kitti.txt"), observations=str(tmp_path / "none.jsonl")))
     back = read_trajectory(tmp_path / "out" / "trajectory.txt")
     assert back.format == "kitti"
     np.testing.assert_allclose(back.T_world_camera, read_trajectory(folder / "kitti.txt").T_world_camera, atol=1e-6)
@@ -132,9 +140,7 @@ def test_errors_go_to_stderr_and_nothing_is_written(
     assert not (tmp_path / "out").exists()
 
 
-def test_interruption_leaves_no_half_written_file(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interruption_leaves_no_half_written_file(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import nolbo_ppl.inference.slam.map_files as export
 
     def interrupted(*_: object) -> None:

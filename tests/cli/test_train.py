@@ -56,10 +56,22 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def config_of(folders: tuple[Path, Path], out: Path, **changes: Any) -> TrainConfig:
     """Four, three and six steps of the three stages; a checkpoint every second step."""
     values: dict[str, Any] = {
-        "out": out, "preset": "nano", "scenes": folders[0], "validation": folders[1], "batch": 4, "shape_batch": 4,
-        "shape_steps": 4, "single_steps": 3, "scene_steps": 6, "checkpoint_every": 2, "log_every": 1,
-        "evaluate_every": 3, "evaluate_scenes": 4, "threads": 1, "bf16": False,
-    }  # fmt: skip
+        "out": out,
+        "preset": "nano",
+        "scenes": folders[0],
+        "validation": folders[1],
+        "batch": 4,
+        "shape_batch": 4,
+        "shape_steps": 4,
+        "single_steps": 3,
+        "scene_steps": 6,
+        "checkpoint_every": 2,
+        "log_every": 1,
+        "evaluate_every": 3,
+        "evaluate_scenes": 4,
+        "threads": 1,
+        "bf16": False,
+    }
     return TrainConfig(**{**values, **changes})
 
 
@@ -125,9 +137,7 @@ def test_the_model_can_be_loaded_and_tells_how_it_came_about(uninterrupted: Path
     assert shapes[-1] < shapes[0]
 
 
-def test_a_run_can_start_from_trained_weights(
-    folders: tuple[Path, Path], uninterrupted: Path, tmp_path: Path
-) -> None:
+def test_a_run_can_start_from_trained_weights(folders: tuple[Path, Path], uninterrupted: Path, tmp_path: Path) -> None:
     """Without steps the weights are those given; shapes stay as they are; another form of the networks is refused."""
     start = str(uninterrupted / "model")
     config = config_of(folders, tmp_path / "same", initial=start, shape_steps=0, single_steps=0, scene_steps=0)
@@ -161,8 +171,16 @@ def test_a_run_can_start_from_grown_weights(folders: tuple[Path, Path], uninterr
 def test_mixed_difficulties_are_thirds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the generated scenes is `standard`, one `full`, one from worlds; held-out scenes as well."""
     monkeypatch.setattr(cache, "BLOCK", 4)
-    config = TrainConfig(tmp_path / "run", preset="nano", difficulty="mixed", count=12, evaluate_scenes=4, cache=tmp_path,
-                         single_steps=0, workers=1)
+    config = TrainConfig(
+        tmp_path / "run",
+        preset="nano",
+        difficulty="mixed",
+        count=12,
+        evaluate_scenes=4,
+        cache=tmp_path,
+        single_steps=0,
+        workers=1,
+    )
     monkeypatch.setattr(training, "LEAST_HELD_OUT", 4)
     data = training.TrainingData(config, 0, 1)
     assert len(data.train) == 12
@@ -183,7 +201,7 @@ def test_metrics_have_a_row_a_step_whose_terms_make_the_loss(uninterrupted: Path
         *(("shapes", i) for i in range(1, 5)),
         *(("single", i) for i in range(1, 4)),
         *(("scenes", i) for i in range(1, 7)),
-    ]  # fmt: skip
+    ]
     for row in history:
         if row["stage"] == "shapes":
             weighted = sum(weight * row.get(f"terms/{name}", 0.0) for name, weight in SHAPE_STAGE.items())
@@ -217,13 +235,13 @@ def test_an_interrupted_run_ends_bit_for_bit_like_an_undisturbed_one(
 def test_interrupted_while_it_calibrates(
     folders: tuple[Path, Path], uninterrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import nolbo_ppl.cli.train
+    import nolbo_ppl.training.trainer
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(nolbo_ppl.cli.train, "calibrate", interrupt)
+        patch.setattr(nolbo_ppl.training.trainer, "calibrate", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(config_of(folders, tmp_path))
     run(config_of(folders, tmp_path))
@@ -340,9 +358,7 @@ def test_boxes_alone_train_and_are_not_calibrated_on_a_handful(folders: tuple[Pa
 def test_instance_labels_split_the_latent(folders: tuple[Path, Path], tmp_path: Path) -> None:
     run(config_of(folders, tmp_path, instance_labels=True))
     model = load(tmp_path / "model")
-    named = {
-        thing["instance"] for _, row in read_jsonl(folders[0] / "scenes.jsonl") for thing in row["objects"]
-    }
+    named = {thing["instance"] for _, row in read_jsonl(folders[0] / "scenes.jsonl") for thing in row["objects"]}
     assert set(model.config.instances) == named
     assert model.config.category_dim == model.config.instance_dim == 8
     assert all(
@@ -500,8 +516,12 @@ def test_two_processes_learn_what_one_does_with_the_joint_batch(folders: tuple[P
     several = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     for start, config in (([], one), (several, two)):
         done = subprocess.run(
-            [sys.executable, *start, str(script), *arguments_of(config)], env={**os.environ, "OMP_NUM_THREADS": "1"},
-            capture_output=True, text=True, timeout=240, check=False,
-        )  # fmt: skip
+            [sys.executable, *start, str(script), *arguments_of(config)],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr[-3000:]
     assert_same(weights(two.out), weights(one.out), 1e-5)

@@ -50,9 +50,17 @@ def test_scene_holds_the_run(viewer: Viewer, folder: Path) -> None:
     found = read_run(folder)
     m = len(found.landmarks)
     assert {name: len(nodes) for name, nodes in viewer.layers.items()} == {
-        "grid": 1, "odometry": 1, "estimate": 1, "truth": 1, "keyframe": 1, "em": 2, "cameras": FRAMES, "objects": m,
-        "ellipsoids": m, "labels": m,
-    }  # fmt: skip
+        "grid": 1,
+        "odometry": 1,
+        "estimate": 1,
+        "truth": 1,
+        "keyframe": 1,
+        "em": 2,
+        "cameras": FRAMES,
+        "objects": m,
+        "ellipsoids": m,
+        "labels": m,
+    }
     assert viewer.scene["/cameras/000007"].image is not None
     line = viewer.scene["/trajectory/estimate"].points
     np.testing.assert_allclose(line[:, 0], found.estimate[:-1, :3, 3], atol=1e-5)

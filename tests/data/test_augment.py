@@ -14,9 +14,15 @@ from nolbo_ppl.geometry.camera import project
 from nolbo_ppl.models.scene_batch import SceneBatch
 
 STILL = Augmentation(
-    geometric_probability=0.0, brightness=0.0, contrast=(1.0, 1.0), saturation=(1.0, 1.0), hue=0.0,
-    inversion_probability=0.0, blur_probability=0.0, noise_probability=0.0,
-)  # fmt: skip
+    geometric_probability=0.0,
+    brightness=0.0,
+    contrast=(1.0, 1.0),
+    saturation=(1.0, 1.0),
+    hue=0.0,
+    inversion_probability=0.0,
+    blur_probability=0.0,
+    noise_probability=0.0,
+)
 MOVING = replace(STILL, geometric_probability=1.0)
 
 

@@ -18,12 +18,26 @@ from nolbo_ppl.parallel import parallel
 from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
 from nolbo_ppl.synthetic.scenes.scene_config import easy, standard
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
-from nolbo_ppl.training.scene_supply import Joined
+from nolbo_ppl.training.scene_supply import JoinedScenes
 
 FIELDS = {
-    "image", "intrinsics", "present", "box", "category", "instance", "viewpoint", "has_viewpoint", "symmetry",
-    "position", "has_position", "diagonal", "has_size", "voxels", "has_voxels", "visibility",
-}  # fmt: skip
+    "image",
+    "intrinsics",
+    "present",
+    "box",
+    "category",
+    "instance",
+    "viewpoint",
+    "has_viewpoint",
+    "symmetry",
+    "position",
+    "has_position",
+    "diagonal",
+    "has_size",
+    "voxels",
+    "has_voxels",
+    "visibility",
+}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +74,7 @@ def test_joined_caches_are_one_data_set(cached: CachedScenes, tmp_path: Path, mo
     """Scenes of both in any order, shapes of both once; the pool of shapes is the same."""
     monkeypatch.setattr(cache, "BLOCK", 8)
     other = write_cache(tmp_path, SceneSource(easy(32), seed=5, instances=2), 8)
-    joined = Joined([cached, other])
+    joined = JoinedScenes([cached, other])
     assert len(joined) == 28
     index = np.array([3, 25, 19, 20, 0, 27])
     batch = joined.batch(index)
@@ -87,9 +101,7 @@ def test_shapes_of_a_cache(source: SceneSource, cached: CachedScenes) -> None:
         assert cached.categories[c] == item.shape.category
 
 
-def test_cache_is_resumed_and_extended(
-    source: SceneSource, cached: CachedScenes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cache_is_resumed_and_extended(source: SceneSource, cached: CachedScenes, monkeypatch: pytest.MonkeyPatch) -> None:
     root = cached.folder.parent
     render = SceneSource.render
     drawn: list[int] = []

@@ -85,9 +85,17 @@ def test_the_supply_mirrors_half_the_scenes_with_their_latents() -> None:
     model = tiny_model(config)
     table = ShapeTable(np.arange(12), batch.voxels.flatten(0, 1).numpy(), batch.category.flatten().numpy())
     table.teach(model, mirrored=True)
-    still = Augmentation(geometric_probability=0.0, mirror_probability=0.5, brightness=0.0, contrast=(1.0, 1.0),
-                         saturation=(1.0, 1.0), hue=0.0, blur_probability=0.0, noise_probability=0.0,
-                         inversion_probability=0.0)  # fmt: skip
+    still = Augmentation(
+        geometric_probability=0.0,
+        mirror_probability=0.5,
+        brightness=0.0,
+        contrast=(1.0, 1.0),
+        saturation=(1.0, 1.0),
+        hue=0.0,
+        blur_probability=0.0,
+        noise_probability=0.0,
+        inversion_probability=0.0,
+    )
     supply = SceneSupply(_Folder(batch), table, 6, 0, config.latent_dim, still)
     mirrored = plain = 0
     for step in range(4):

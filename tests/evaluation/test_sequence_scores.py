@@ -21,7 +21,7 @@ from nolbo_ppl.evaluation.sequence_scores import (
     position_figures,
     shape_figures,
 )
-from nolbo_ppl.evaluation.sequence_truth import Matched, read_truth
+from nolbo_ppl.evaluation.sequence_truth import MatchResult, read_truth
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 from nolbo_ppl.geometry.rotation import ray_rotation, viewpoint_to_matrix
 from tests.evaluation.test_sequence_truth import names
@@ -45,9 +45,13 @@ def test_mass_of_the_azimuth_region_far_off_axis() -> None:
     R_ray = ray_rotation(torch.from_numpy(position)).numpy()
     off = 0.21
     true = R_ray @ viewpoint_to_matrix(torch.tensor([1.1 + off, 0.2, -0.1])).numpy()
-    modes = [[{"weight": 1.0, "azimuth": 1.1, "concentration": 30.0}],
-             [{"weight": 0.5, "azimuth": 1.1, "concentration": 30.0}, {"weight": 0.5, "azimuth": 1.1 - math.pi,
-                                                                       "concentration": 30.0}]]  # fmt: skip
+    modes = [
+        [{"weight": 1.0, "azimuth": 1.1, "concentration": 30.0}],
+        [
+            {"weight": 0.5, "azimuth": 1.1, "concentration": 30.0},
+            {"weight": 0.5, "azimuth": 1.1 - math.pi, "concentration": 30.0},
+        ],
+    ]
     mass = orientation_mass(modes, np.tile(position, (2, 1)), np.tile(true, (2, 1, 1)), np.array([1, 2]))
     expected = vonmises(30.0).cdf(off) - vonmises(30.0).cdf(-off)
     # Two modes half a turn apart, of an object that half a turn leaves as it is: one mode.
@@ -81,9 +85,14 @@ def test_landmarks_against_objects(drive: SimulatedDrive) -> None:
     np.testing.assert_allclose(purity, [1, 1, 2 / 3, 1, 0])
     figures = map_figures(object_of, owner, purity, np.array([True, True, True, True, False]), truth, least_detections=2)
     assert figures == {
-        "landmarks": 4, "objects": len(truth), "objects_detected": 2, "objects_mapped": 2, "duplicates": 1, "spurious": 1,
+        "landmarks": 4,
+        "objects": len(truth),
+        "objects_detected": 2,
+        "objects_mapped": 2,
+        "duplicates": 1,
+        "spurious": 1,
         "mean_purity": pytest.approx((1 + 1 + 2 / 3 + 1) / 4, abs=1e-6),
-    }  # fmt: skip
+    }
 
 
 def test_landmark_errors_do_not_depend_on_the_world_of_the_estimate(drive: SimulatedDrive) -> None:
@@ -96,7 +105,7 @@ def test_landmark_errors_do_not_depend_on_the_world_of_the_estimate(drive: Simul
     np.testing.assert_allclose(error, [0.0, 1.0, np.nan], atol=1e-9)
 
 
-def known(drive: SimulatedDrive) -> Matched:
+def known(drive: SimulatedDrive) -> MatchResult:
     """Every detection with its object, from the simulation itself."""
     truth, table = read_truth(drive.folder, names(drive)), drive.model.table
     row = np.full(len(table), -1)
@@ -104,7 +113,7 @@ def known(drive: SimulatedDrive) -> Matched:
         hit = np.flatnonzero(truth.frames[table.frame[k]].object == i)
         row[k] = hit[0] if len(hit) else -1
     of = np.where(row >= 0, drive.object_of, -1)
-    return Matched(of, row, of >= 0, int((of >= 0).sum()), int((of >= 0).sum()))
+    return MatchResult(of, row, of >= 0, int((of >= 0).sum()), int((of >= 0).sum()))
 
 
 def test_regions_of_honest_noise_hold_what_they_promise(drive: SimulatedDrive) -> None:

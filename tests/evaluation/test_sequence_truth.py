@@ -46,11 +46,13 @@ def test_every_simulated_detection_finds_its_object(drive: SimulatedDrive) -> No
 
 def one_frame(box: list[list[float]], visibility: list[float]) -> DriveTruth:
     n = len(box)
-    frame = TrueFrame(np.arange(n), np.array(box), np.tile([0, 0, 5.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1)),
-                      np.array(visibility))  # fmt: skip
+    frame = TrueFrame(
+        np.arange(n), np.array(box), np.tile([0, 0, 5.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1)), np.array(visibility)
+    )
     text = tuple("x" * n)
-    return DriveTruth(text, text, text, np.tile(np.eye(4), (n, 1, 1)), np.ones(n), np.ones(n, dtype=int), np.zeros(n, dtype=bool),
-                      {}, (frame,))  # fmt: skip
+    return DriveTruth(
+        text, text, text, np.tile(np.eye(4), (n, 1, 1)), np.ones(n), np.ones(n, dtype=int), np.zeros(n, dtype=bool), {}, (frame,)
+    )
 
 
 def test_hardly_seen_objects_count_neither_way() -> None:
@@ -75,10 +77,13 @@ def test_two_detections_may_show_one_object() -> None:
     ("file", "change", "match"),
     [
         ("objects.json", "[]", "expected one of objects.json"),
-        ("scenes.jsonl", json.dumps({"image": "images/000000.png", "intrinsics": [9, 9, 9, 9], "objects": []}) + "\n",
-         "lengths differ"),
+        (
+            "scenes.jsonl",
+            json.dumps({"image": "images/000000.png", "intrinsics": [9, 9, 9, 9], "objects": []}) + "\n",
+            "lengths differ",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_truth_is_refused(drive: SimulatedDrive, tmp_path: Path, file: str, change: str, match: str) -> None:
     folder = tmp_path / "drive"
     shutil.copytree(drive.folder, folder)

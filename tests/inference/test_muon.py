@@ -68,8 +68,9 @@ def test_the_rest_takes_the_steps_of_torchs_adamw() -> None:
     vectors = [p for p in alone.parameters() if p.dim() <= 1 and p.requires_grad]
     theirs = torch.optim.AdamW(
         [{"params": [alone.colours.weight, alone.last.weight], "weight_decay": 0.3}, {"params": vectors, "weight_decay": 0.0}],
-        lr=0.01, betas=(0.9, 0.99),
-    )  # fmt: skip
+        lr=0.01,
+        betas=(0.9, 0.99),
+    )
     for step in range(3):
         for optimizer in (ours, theirs):
             optimizer.step()

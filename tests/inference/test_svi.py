@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.inference import svi as optimisation
-from nolbo_ppl.inference.elbo import ElboResult, SceneElbo, SceneLoss
+from nolbo_ppl.inference.elbo import ElboResult, SceneELBO, SceneLoss
 from nolbo_ppl.inference.svi import OptimisationConfig, OptimisationState, learning_rate
 from nolbo_ppl.io.tensors import load_tensors, save_tensors
 from nolbo_ppl.training.stages import scene_weights
@@ -81,7 +81,7 @@ def test_a_step_is_adamw_by_hand() -> None:
 def scene_state(seed: int = 0, optimizer: str = "adamw") -> OptimisationState:
     model = tiny_model(seed=seed)
     model.shape_guide.requires_grad_(False)
-    loss = SceneLoss(model.story, model.guide, SceneElbo(scene_weights("inclusive", {"voxels": 0.01})))
+    loss = SceneLoss(model.story, model.guide, SceneELBO(scene_weights("inclusive", {"voxels": 0.01})))
     config = OptimisationConfig(steps=6, learning_rate=1e-2, warmup=2, decay=0.5, ema=0.9, optimizer=optimizer)
     return optimisation.init(model, loss, config)
 

@@ -26,14 +26,33 @@ def test_round_trip_of_every_field(tmp_path: Path) -> None:
     n = 5
     root = rng.standard_normal((n, 3, 3))
     table = make_table(
-        np.arange(n), rng.standard_normal((n, 3)), position_covariance=root @ np.swapaxes(root, 1, 2) + np.eye(3),
-        rotation=so3_exp(rng.standard_normal((n, 3))), rotation_scale=0.1, latent=rng.standard_normal((n, 4)),
-        latent_scale=0.3, objectness=rng.random(n), category=["car", None, "bus", "car", "car"],
-        size=rng.random((n, 3)) + 1, symmetry=[0, 1, 2, -1, 4], id=list("abcde"))
+        np.arange(n),
+        rng.standard_normal((n, 3)),
+        position_covariance=root @ np.swapaxes(root, 1, 2) + np.eye(3),
+        rotation=so3_exp(rng.standard_normal((n, 3))),
+        rotation_scale=0.1,
+        latent=rng.standard_normal((n, 4)),
+        latent_scale=0.3,
+        objectness=rng.random(n),
+        category=["car", None, "bus", "car", "car"],
+        size=rng.random((n, 3)) + 1,
+        symmetry=[0, 1, 2, -1, 4],
+        id=list("abcde"),
+    )
     write_observations(tmp_path / "o.jsonl", table)
     back = read_observations(tmp_path / "o.jsonl", frames=n)
-    for name in ("frame", "position", "position_covariance", "rotation", "rotation_scale", "latent", "latent_scale",
-                 "objectness", "size", "symmetry"):
+    for name in (
+        "frame",
+        "position",
+        "position_covariance",
+        "rotation",
+        "rotation_scale",
+        "latent",
+        "latent_scale",
+        "objectness",
+        "size",
+        "symmetry",
+    ):
         np.testing.assert_allclose(getattr(back, name), getattr(table, name), rtol=2e-6, atol=2e-6, err_msg=name)
     assert back.category == table.category and back.id == table.id
     check_table(back, n)
@@ -142,12 +161,21 @@ def test_modes_of_orientations_round_trip(tmp_path: Path) -> None:
 
 
 def test_modes_of_a_table_are_checked() -> None:
-    fields = {"frame": [0, 0], "position": np.ones((2, 3)), "mode_weight": np.ones((2, 1)), "mode_std": 0.1,
-              "mode_rotation": np.tile(np.eye(3), (2, 1, 1, 1)), "id": ["good", "bad"]}
+    fields = {
+        "frame": [0, 0],
+        "position": np.ones((2, 3)),
+        "mode_weight": np.ones((2, 1)),
+        "mode_std": 0.1,
+        "mode_rotation": np.tile(np.eye(3), (2, 1, 1, 1)),
+        "id": ["good", "bad"],
+    }
     check_table(make_table(**fields), 1)
     with pytest.raises(InputError, match="incomplete"):
         make_table([0], np.ones((1, 3)), mode_weight=np.ones((1, 1)))
-    for change, match in (({"mode_weight": [[1.0], [-1.0]]}, "mode_weight"), ({"mode_std": [[0.1], [0.0]]}, "mode_std"),
-                          ({"mode_rotation": np.stack([np.eye(3), 2 * np.eye(3)])[:, None]}, "mode_rotation")):
+    for change, match in (
+        ({"mode_weight": [[1.0], [-1.0]]}, "mode_weight"),
+        ({"mode_std": [[0.1], [0.0]]}, "mode_std"),
+        ({"mode_rotation": np.stack([np.eye(3), 2 * np.eye(3)])[:, None]}, "mode_rotation"),
+    ):
         with pytest.raises(InputError, match=f"'bad'.*{match}"):
             check_table(make_table(**{**fields, "rotation": np.eye(3), **change}), 1)

@@ -94,8 +94,10 @@ def test_poses_of_a_part_of_the_frames(tmp_path: Path) -> None:
     """From rows of all frames, rows of the part, or by time, where only times of the part need a pose."""
     T, times, part = poses(12), 50.0 + 0.05 * np.arange(12), slice(3, 8)
     for name, trajectory in {
-        "all": Trajectory(T), "part": Trajectory(T[part]), "timed": Trajectory(T[2:], times[2:], "tum"),
-    }.items():  # fmt: skip
+        "all": Trajectory(T),
+        "part": Trajectory(T[part]),
+        "timed": Trajectory(T[2:], times[2:], "tum"),
+    }.items():
         write_trajectory(tmp_path / name, trajectory)
         np.testing.assert_allclose(poses_of_frames(tmp_path / name, 12, times, part), T[part], atol=1e-9)
     with pytest.raises(InputError, match="got 10 of 12 matched"):

@@ -7,7 +7,7 @@ from scipy.stats import binomtest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.metrics.detection import Matches, average_precision
-from nolbo_ppl.metrics.intervals import Estimate, estimate, resample_weights, widened, wilson_interval
+from nolbo_ppl.metrics.intervals import IntervalEstimate, estimate, resample_weights, widened, wilson_interval
 from nolbo_ppl.metrics.statistics import by_group, mean_of_defined, weighted_mean, weighted_median
 
 
@@ -86,7 +86,7 @@ def test_pivotal_interval_undoes_the_bias_of_resampling():
 
 def test_undefined_figures_are_none():
     weights = resample_weights(3, 10, np.random.default_rng(3))
-    assert estimate(lambda w: np.full(len(w), np.nan), weights, 0) == Estimate(None, None, None, 0)
+    assert estimate(lambda w: np.full(len(w), np.nan), weights, 0) == IntervalEstimate(None, None, None, 0)
 
 
 @pytest.mark.parametrize("successes, trials", [(0, 10), (3, 10), (10, 10), (457, 500), (1, 1)])
@@ -99,10 +99,10 @@ def test_wilson_against_scipy(successes, trials):
 
 def test_widened_interval_has_width_at_one():
     low, _ = wilson_interval(20, 20)
-    assert widened(Estimate(1.0, 1.0, 1.0, 20)) == Estimate(1.0, low, 1.0, 20)
-    wide = Estimate(0.5, 0.1, 0.9, 100)
+    assert widened(IntervalEstimate(1.0, 1.0, 1.0, 20)) == IntervalEstimate(1.0, low, 1.0, 20)
+    wide = IntervalEstimate(0.5, 0.1, 0.9, 100)
     assert widened(wide) == wide
-    assert widened(Estimate(None, None, None, 0)) == Estimate(None, None, None, 0)
+    assert widened(IntervalEstimate(None, None, None, 0)) == IntervalEstimate(None, None, None, 0)
 
 
 def test_speed_of_a_thousand_scenes():

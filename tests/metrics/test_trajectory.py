@@ -46,9 +46,7 @@ def test_alignment_is_the_minimum_over_rigid_motions() -> None:
     def rmse(xi: np.ndarray) -> float:
         return absolute_trajectory_error(se3_exp(xi) @ estimate, truth, "none").rmse
 
-    best = min(
-        minimize(rmse, start, method="BFGS").fun for start in 3 * np.random.default_rng(4).standard_normal((8, 6))
-    )
+    best = min(minimize(rmse, start, method="BFGS").fun for start in 3 * np.random.default_rng(4).standard_normal((8, 6)))
     assert found == pytest.approx(best, abs=1e-6)
 
 
@@ -60,9 +58,7 @@ def test_origin_alignment_starts_at_the_truth() -> None:
 def test_errors_are_invariant_to_a_rigid_motion() -> None:
     estimate, truth = walk(40, 7), walk(40, 8)
     moved = se3_exp(np.array([0.5, 0.2, -2.0, 10.0, -3.0, 4.0])) @ estimate
-    assert absolute_trajectory_error(moved, truth).rmse == pytest.approx(
-        absolute_trajectory_error(estimate, truth).rmse
-    )
+    assert absolute_trajectory_error(moved, truth).rmse == pytest.approx(absolute_trajectory_error(estimate, truth).rmse)
     assert relative_pose_error(moved, truth).rmse == pytest.approx(relative_pose_error(estimate, truth).rmse)
 
 
@@ -93,8 +89,7 @@ def test_bad_values_raise() -> None:
         relative_pose_error(walk(4, 0), walk(4, 1), delta=4)
 
 
-@pytest.mark.parametrize(
-    ("name", "unaligned", "aligned"), [("ORB", 7.790289, 1.303450), ("SPTAM", 9.224542, 3.738488)])
+@pytest.mark.parametrize(("name", "unaligned", "aligned"), [("ORB", 7.790289, 1.303450), ("SPTAM", 9.224542, 3.738488)])
 def test_published_figures(data_dir: Path, name: str, unaligned: float, aligned: float) -> None:
     folder = data_dir / "kitti_odometry" / "estimates"
     truth = read_trajectory(folder / "KITTI_00_gt.txt").T_world_camera
@@ -113,8 +108,13 @@ def test_equal_to_evo(tmp_path: Path) -> None:
 
     def evo(program: str, *options: str) -> float:
         run = subprocess.run(
-            [str(Path(tool).with_name(program)), "kitti", "truth.txt", "estimate.txt", *options], cwd=tmp_path,
-            capture_output=True, text=True, check=True, env={"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"})
+            [str(Path(tool).with_name(program)), "kitti", "truth.txt", "estimate.txt", *options],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=True,
+            env={"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
+        )
         found = re.search(r"rmse\s+([0-9.]+)", run.stdout)
         assert found is not None, run.stdout
         return float(found[1])

@@ -14,8 +14,31 @@ from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.shape_networks import VoxelDecoder
 from tests.factories import tiny_config
 
-YOLO9000_TABLE_6 = [32, "M", 64, "M", 128, (64,), 128, "M", 256, (128,), 256, "M", 512, (256,), 512, (256,), 512, "M",
-                    1024, (512,), 1024, (512,), 1024]  # fmt: skip
+YOLO9000_TABLE_6 = [
+    32,
+    "M",
+    64,
+    "M",
+    128,
+    (64,),
+    128,
+    "M",
+    256,
+    (128,),
+    256,
+    "M",
+    512,
+    (256,),
+    512,
+    (256,),
+    512,
+    "M",
+    1024,
+    (512,),
+    1024,
+    (512,),
+    1024,
+]
 """Filters of 3 x 3 convolutions, of 1 x 1 convolutions in brackets, and maxpools."""
 
 

@@ -30,14 +30,26 @@ def test_sites_and_their_shapes() -> None:
     config = instance_config()
     batch = random_batch(config, 2, 3, objects=2)
     trace = trace_of(config, observed_scene(config, batch))
-    sites = {n: tuple(s["fn"].batch_shape) for n, s in trace.nodes.items()
-             if s["type"] == "sample" and type(s["fn"]).__name__ != "_Subsample"}  # fmt: skip
+    sites = {
+        n: tuple(s["fn"].batch_shape)
+        for n, s in trace.nodes.items()
+        if s["type"] == "sample" and type(s["fn"]).__name__ != "_Subsample"
+    }
     objects = (2, 3)
     assert sites == {
-        "objectness": (2, 32), "label": objects, "shape_latent": objects, "instance": objects,
-        "instance_latent": objects, "orientation_latent": objects, "rotation": objects, "box_latent": objects,
-        "box": objects, "range_latent": objects, "range": objects, "voxels": (4,),
-    }  # fmt: skip
+        "objectness": (2, 32),
+        "label": objects,
+        "shape_latent": objects,
+        "instance": objects,
+        "instance_latent": objects,
+        "orientation_latent": objects,
+        "rotation": objects,
+        "box_latent": objects,
+        "box": objects,
+        "range_latent": objects,
+        "range": objects,
+        "voxels": (4,),
+    }
     assert len(pyro.get_param_store()) == 0, "no parameter enters the global store"
 
 

@@ -147,9 +147,13 @@ def test_single_mode_orientation(form: str) -> None:
 
 @pytest.mark.parametrize(
     ("shape", "message"),
-    [((3, 64, 64), "wrong shape"), ((1, 1, 64, 64), "wrong shape"), ((1, 3, 64, 65), "multiples of 32"),
-     ((1, 3, 0, 64), "multiples of 32")],
-)  # fmt: skip
+    [
+        ((3, 64, 64), "wrong shape"),
+        ((1, 1, 64, 64), "wrong shape"),
+        ((1, 3, 64, 65), "multiples of 32"),
+        ((1, 3, 0, 64), "multiples of 32"),
+    ],
+)
 def test_wrong_images(shape: tuple[int, ...], message: str) -> None:
     model = tiny_model()
     with pytest.raises(InputError, match=message):

@@ -13,8 +13,14 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.models.posterior_calibration import Calibration
 from tests.factories import random_posterior, tiny_config
 
-FACTORS = {"label_slope": "label_logits", "azimuth_concentration": "azimuth_natural", "angle_scale": "angle_scale",
-           "shape_scale": "shape_scale", "box_scale": "box_scale", "range_scale": "range_scale"}  # fmt: skip
+FACTORS = {
+    "label_slope": "label_logits",
+    "azimuth_concentration": "azimuth_natural",
+    "angle_scale": "angle_scale",
+    "shape_scale": "shape_scale",
+    "box_scale": "box_scale",
+    "range_scale": "range_scale",
+}
 
 
 @pytest.mark.parametrize(("factor", "parameter"), FACTORS.items())
@@ -28,9 +34,7 @@ def test_each_factor_changes_its_parameter_only(factor: str, parameter: str) -> 
 
 def test_objectness_is_affine_in_the_log_odds() -> None:
     logit = torch.tensor([-2.0, 0.0, 3.0])
-    torch.testing.assert_close(
-        Calibration(objectness_slope=2.0, objectness_shift=-0.5).objectness(logit), 2 * logit - 0.5
-    )
+    torch.testing.assert_close(Calibration(objectness_slope=2.0, objectness_shift=-0.5).objectness(logit), 2 * logit - 0.5)
     assert torch.equal(Calibration().objectness(logit), logit)
 
 

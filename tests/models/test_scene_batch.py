@@ -36,12 +36,11 @@ def flat(batch: SceneBatch) -> dict[str, torch.Tensor]:
 
 
 def test_cells() -> None:
-    box = torch.tensor(
-        [[0.0, 0, 10, 10], [15.9, 0, 16.0, 10], [16.0, 31, 16.0, 33], [60.0, 60, 70, 70], [-9.0, 0, 1, 1]]
-    )
+    box = torch.tensor([[0.0, 0, 10, 10], [15.9, 0, 16.0, 10], [16.0, 31, 16.0, 33], [60.0, 60, 70, 70], [-9.0, 0, 1, 1]])
     assert cell_of(box, 4, 4, 16).tolist() == [0, 0, 9, 15, 0]
-    torch.testing.assert_close(cell_centre(torch.tensor([0, 5, 11]), 4, 16, torch.float64),
-                               torch.tensor([[8.0, 8.0], [24.0, 24.0], [56.0, 40.0]]))  # fmt: skip
+    torch.testing.assert_close(
+        cell_centre(torch.tensor([0, 5, 11]), 4, 16, torch.float64), torch.tensor([[8.0, 8.0], [24.0, 24.0], [56.0, 40.0]])
+    )
     assert grid_size(64, 96, CONFIG) == (4, 6)
 
 
@@ -139,14 +138,25 @@ def test_batches_are_cut_and_converted() -> None:
 def test_neutral_batches_keep_what_is_known() -> None:
     batch = random_batch(CONFIG, 2, 3, objects=2)
     batch.has_viewpoint[0, 0] = batch.has_position[0, 1] = batch.has_size[1, 0] = batch.has_voxels[1, 1] = False
-    for name, mask in (("viewpoint", "has_viewpoint"), ("position", "has_position"), ("diagonal", "has_size"),
-                       ("shape_loc", "has_voxels"), ("shape_scale", "has_voxels"), ("box", "present")):  # fmt: skip
+    for name, mask in (
+        ("viewpoint", "has_viewpoint"),
+        ("position", "has_position"),
+        ("diagonal", "has_size"),
+        ("shape_loc", "has_voxels"),
+        ("shape_scale", "has_voxels"),
+        ("box", "present"),
+    ):
         getattr(batch, name)[~getattr(batch, mask)] = math.nan
     neutral = batch.neutral()
     for field in dataclasses.fields(SceneBatch):
         value = getattr(neutral, field.name)
         assert value is None or not value.is_floating_point() or bool(torch.isfinite(value).all()), field.name
-    for name, mask in (("viewpoint", "has_viewpoint"), ("position", "has_position"), ("diagonal", "has_size"),
-                       ("shape_loc", "has_voxels"), ("box", "present")):  # fmt: skip
+    for name, mask in (
+        ("viewpoint", "has_viewpoint"),
+        ("position", "has_position"),
+        ("diagonal", "has_size"),
+        ("shape_loc", "has_voxels"),
+        ("box", "present"),
+    ):
         known = getattr(batch, mask)
         assert torch.equal(getattr(neutral, name)[known], getattr(batch, name)[known])

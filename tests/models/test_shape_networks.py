@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
 
-from nolbo_ppl.inference.elbo import PURE_BOUND, SceneElbo
+from nolbo_ppl.inference.elbo import PURE_BOUND, SceneELBO
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import unpack_bits
 from nolbo_ppl.models.shape_networks import PatchReader, PatchWriter, PriorNetwork, VoxelDecoder, VoxelEncoder, bounded_exp
@@ -41,9 +41,7 @@ def test_instance_prior() -> None:
     """p(i | l) is uniform over a category's own instances and "novel"; the means of the latter are zero."""
     prior = LabelPrior(instance_config()).double()
     p = prior.instance_log_probability(torch.tensor([[0, 1], [2, 3]])).exp()
-    expected = torch.tensor(
-        [[[0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1]], [[0, 1, 1, 1, 0, 1], [0, 0, 0, 0, 1, 1]]]
-    ).double()
+    expected = torch.tensor([[[0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1]], [[0, 1, 1, 1, 0, 1], [0, 0, 0, 0, 1, 1]]]).double()
     torch.testing.assert_close(p, expected / expected.sum(-1, keepdim=True))
     mean = prior.instance_mean()
     assert mean.shape == (6, 2)
@@ -103,7 +101,7 @@ def test_bound_of_the_shape_autoencoder(instances: bool) -> None:
     category, instance = torch.tensor([2, 2, 1, 0]), torch.tensor([1, -1, 0, -1])
     batch = ShapeBatch(scene.voxels[0], category, instance, scene.noise[0])
     with torch.no_grad():
-        result = SceneElbo(PURE_BOUND).evaluate(model.shape_story, model.shape_guide, batch, scenes=4)
+        result = SceneELBO(PURE_BOUND).evaluate(model.shape_story, model.shape_guide, batch, scenes=4)
         loc, scale = model.shape_guide.posterior(batch.voxels)
         mean = model.story.prior.category_mean()[category]
         if instances:

@@ -82,10 +82,12 @@ def test_the_jacobian_of_sampson_residuals_is_their_derivative() -> None:
     for axis in range(5):
         delta = np.zeros(5)
         delta[axis] = 1e-6
+
         def moved(sign: float, delta: np.ndarray = delta) -> np.ndarray:
             turned = R @ se3_exp(np.concatenate([sign * delta[:3], np.zeros(3)]))[:3, :3]
             direction = u + sign * tangent(u) @ delta[3:]
             return sampson(turned, direction / np.linalg.norm(direction), first, second, INTRINSICS)[0]
+
         np.testing.assert_allclose((moved(1) - moved(-1)) / 2e-6, jacobian[:, axis], rtol=1e-4, atol=1e-3)
 
 

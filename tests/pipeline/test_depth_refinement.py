@@ -85,9 +85,11 @@ def seen(centre: np.ndarray, radius: float, guide: float, spread: float) -> obje
     ray = position / np.linalg.norm(position)
     covariance = 1e-4 * np.eye(3) + (spread * np.linalg.norm(position)) ** 2 * np.outer(ray, ray)
     return observations(
-        position=np.tile(position, (2, 1)), position_covariance=np.tile(covariance, (2, 1, 1)),
-        box=np.tile([*(pixel - half), *(pixel + half)], (2, 1)), size=np.full((2, 3), 2 * radius),
-    )  # fmt: skip
+        position=np.tile(position, (2, 1)),
+        position_covariance=np.tile(covariance, (2, 1, 1)),
+        box=np.tile([*(pixel - half), *(pixel + half)], (2, 1)),
+        size=np.full((2, 3), 2 * radius),
+    )
 
 
 @pytest.mark.parametrize("guide", [0.8, 1.0, 1.25])

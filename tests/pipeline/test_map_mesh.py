@@ -23,8 +23,7 @@ def slab() -> np.ndarray:
 
 
 def row(name: str = "L0", **change: Any) -> dict[str, Any]:
-    return {"name": name, "position": [3.0, 0.5, 8.0], "existence": 0.9, "category": "car", "size": [2.0, 1.0, 2.0],
-            **change}  # fmt: skip
+    return {"name": name, "position": [3.0, 0.5, 8.0], "existence": 0.9, "category": "car", "size": [2.0, 1.0, 2.0], **change}
 
 
 def test_a_landmark_lies_at_its_place_at_its_size() -> None:
@@ -42,8 +41,13 @@ def test_a_landmark_without_orientation_stands_upright() -> None:
 
 
 def test_the_file_can_be_read_back(tmp_path: Path) -> None:
-    landmarks = [row(), row("L1", position=[-2.0, 0.0, 4.0], category="chair"), row("L2", existence=0.1), row("L3"),
-                 row("L4", detections=0.0)]  # fmt: skip
+    landmarks = [
+        row(),
+        row("L1", position=[-2.0, 0.0, 4.0], category="chair"),
+        row("L2", existence=0.1),
+        row("L3"),
+        row("L4", detections=0.0),
+    ]
     voxels = {"L0": slab(), "L1": 0.3 * slab(), "L2": slab(), "L4": slab()}
     # L1 is nowhere sure, L2 hardly exists, L3 has no shape, L4 no detection.
     path = make_pose(np.tile(np.eye(3), (4, 1, 1)), np.array([[0, 0, z] for z in range(4)], dtype=float))
@@ -72,8 +76,12 @@ def test_best_views_weigh_probability_objectness_and_size(tmp_path: Path) -> Non
         {"frame": 2, "box": [0, 0, 50, 50], "objectness": 0.9},
         {"frame": 2, "position": [0, 0, 1]},  # from a detector without boxes
     ]
-    found = [{"landmarks": {"L0": 1.0}}, {"landmarks": {"L0": 1.0}}, {"landmarks": {"L0": 0.1, "L1": 0.8}},
-             {"landmarks": {"L1": 1.0}}]  # fmt: skip
+    found = [
+        {"landmarks": {"L0": 1.0}},
+        {"landmarks": {"L0": 1.0}},
+        {"landmarks": {"L0": 0.1, "L1": 0.8}},
+        {"landmarks": {"L1": 1.0}},
+    ]
     views = best_views(seen, found)
     assert (views["L0"].frame, views["L1"].frame) == (1, 2)
     assert views["L0"].value == pytest.approx(0.5 * 40)

@@ -26,8 +26,13 @@ def test_where_lengths_come_from(drive: SimulatedDrive, tmp_path: Path) -> None:
     (tmp_path / "short.txt").write_text("1.0\n")
 
     def scale(**change: Any) -> Any:
-        values: dict[str, Any] = {"images": folder / "images", "intrinsics": folder / "intrinsics.json", "out": tmp_path / "run",
-                                  "every": 3, **change}  # fmt: skip
+        values: dict[str, Any] = {
+            "images": folder / "images",
+            "intrinsics": folder / "intrinsics.json",
+            "out": tmp_path / "run",
+            "every": 3,
+            **change,
+        }
         config = RunConfig(**values)
         return scale_of(open_drive(config), config)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.pipeline.stage_store import RECORD, Stage, fingerprints, run_stages
+from nolbo_ppl.pipeline.stage_store import RECORD, PipelineStage, fingerprints, run_stages
 
 
 class Workshop:
@@ -26,9 +26,11 @@ class Workshop:
         if name == self.fail:
             raise KeyboardInterrupt
 
-    def stages(self, **settings: int) -> list[Stage]:
+    def stages(self, **settings: int) -> list[PipelineStage]:
         outputs = {"a": ("a.txt",), "b": ("b.txt", "b", "maybe.txt?"), "c": ("c.txt",)}
-        return [Stage(name, out, settings.get(name, 0), lambda name=name: self.work(name)) for name, out in outputs.items()]
+        return [
+            PipelineStage(name, out, settings.get(name, 0), lambda name=name: self.work(name)) for name, out in outputs.items()
+        ]
 
     def run(self, **settings: int) -> dict[str, float]:
         self.ran = []

@@ -22,6 +22,8 @@ def chromium() -> str:
     if found is None:
         pytest.skip(f"no browser on PATH (one of {', '.join(NAMES)}): apt-get install chromium")
     return found
+
+
 PATIENCE = 180.0
 """Seconds to wait for an answer: machines that test are busy."""
 
@@ -32,11 +34,24 @@ class Browser:
     def __init__(self, folder: Path, width: int = 1240, height: int = 900) -> None:
         client = pytest.importorskip("websockets.sync.client", reason="websockets (with viser) speaks to the browser")
         self.process = subprocess.Popen(
-            [chromium(), "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars", "--no-first-run",
-             "--remote-debugging-port=0", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader",
-             f"--user-data-dir={folder}", f"--window-size={width},{height}", "about:blank"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            [
+                chromium(),
+                "--headless",
+                "--no-sandbox",
+                "--disable-dev-shm-usage",
+                "--hide-scrollbars",
+                "--no-first-run",
+                "--remote-debugging-port=0",
+                "--enable-unsafe-swiftshader",
+                "--use-gl=angle",
+                "--use-angle=swiftshader",
+                f"--user-data-dir={folder}",
+                f"--window-size={width},{height}",
+                "about:blank",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         try:
             address = self._page_address(folder / "DevToolsActivePort")
             # Without keep-alive: a busy page is no dead one.

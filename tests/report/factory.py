@@ -11,7 +11,14 @@ import numpy as np
 from PIL import Image
 
 from nolbo_ppl.cli.slam import SlamArguments, run
-from nolbo_ppl.data.simulate import R_WORLD_UPRIGHT, DetectorConfig, Drive, World, simulate_detections, simulate_odometry
+from nolbo_ppl.data.simulate import (
+    R_WORLD_UPRIGHT,
+    DetectorConfig,
+    SimulatedSequence,
+    SimulatedWorld,
+    simulate_detections,
+    simulate_odometry,
+)
 from nolbo_ppl.geometry.pose import inverse, make_pose, so3_exp
 from nolbo_ppl.geometry.voxels import voxel_centres
 from nolbo_ppl.inference.slam.landmark_shapes import write_voxels
@@ -36,7 +43,7 @@ def square() -> np.ndarray:
 
 
 @cache
-def drive() -> Drive:
+def drive() -> SimulatedSequence:
     """The drive: truth, odometry, detections."""
     rng = np.random.default_rng(3)
     truth = square()
@@ -46,13 +53,13 @@ def drive() -> Drive:
     category = np.arange(OBJECTS) % len(NAMES)
     means = 3.0 * rng.standard_normal((len(NAMES), 4))
     rotation = R_WORLD_UPRIGHT @ so3_exp(rng.uniform(-np.pi, np.pi, (OBJECTS, 1)) * np.array([0.0, 0.0, 1.0]))
-    world = World(position, rotation, category, means[category] + rng.standard_normal((OBJECTS, 4)), means)
+    world = SimulatedWorld(position, rotation, category, means[category] + rng.standard_normal((OBJECTS, 4)), means)
     odometry = simulate_odometry(truth, rng, rotation_scale=0.02, translation_ratio=0.03, planar=True)
     detector = DetectorConfig(field_of_view=2.2, minimum_range=1.0, maximum_range=14.0, clutter_rate=0.1, miss_rate=0.1)
     table, source = simulate_detections(truth, world, detector, rng)
     names = tuple(None if c is None else NAMES[int(c[1:])] for c in table.category)
     size = np.where(source[:, None] >= 0, np.array([1.2, 2.4, 1.0]), np.nan)
-    return Drive(truth, odometry, replace(table, category=names, size=size), source, world)
+    return SimulatedSequence(truth, odometry, replace(table, category=names, size=size), source, world)
 
 
 def make_slam(folder: Path) -> Path:
@@ -98,16 +105,29 @@ def make_run(folder: Path) -> Path:
     names = [None if o < 0 else f"O{o}" for o in made.object_of]
     write_json(folder / "objects.json", {"objects": dict(zip(made.observations.id, names))})
     slam = json.loads((folder / "slam" / "summary.json").read_text(encoding="utf-8"))
-    write_json(folder / "run.json", {
-        "command": ["nolbo", "run", "--images", "<drive>"],
-        "configuration": {"model": "tiny", "loop_gap": 10, "slam": {"samples": 64}},
-        "versions": {"nolbo-ppl": "0.1.0"}, "seconds": {"observe": 3.2, "slam": 1.1}, "complete": ["observe", "slam"],
-    })  # fmt: skip
-    write_json(folder / "summary.json", {
-        "frames": FRAMES, "before": slam["before"], "after": slam["after"], "oracle": {"ate": 0.9 * slam["after"]["ate"]},
-        "observation_figures": {
-            "recall": 0.91, "position_error": {"all": {"median": 0.2, "p90": 0.5}, "0-5 m": {"median": 0.1}},
+    write_json(
+        folder / "run.json",
+        {
+            "command": ["nolbo", "run", "--images", "<drive>"],
+            "configuration": {"model": "tiny", "loop_gap": 10, "slam": {"samples": 64}},
+            "versions": {"nolbo-ppl": "0.1.0"},
+            "seconds": {"observe": 3.2, "slam": 1.1},
+            "complete": ["observe", "slam"],
         },
-        "images_per_second": 12.5, "warnings": [],
-    })  # fmt: skip
+    )
+    write_json(
+        folder / "summary.json",
+        {
+            "frames": FRAMES,
+            "before": slam["before"],
+            "after": slam["after"],
+            "oracle": {"ate": 0.9 * slam["after"]["ate"]},
+            "observation_figures": {
+                "recall": 0.91,
+                "position_error": {"all": {"median": 0.2, "p90": 0.5}, "0-5 m": {"median": 0.1}},
+            },
+            "images_per_second": 12.5,
+            "warnings": [],
+        },
+    )
     return folder

@@ -80,8 +80,10 @@ def test_legend_hides_a_layer_in_its_own_figure(page: Browser) -> None:
 
 def test_slider_moves_trajectory_and_landmarks(page: Browser, run_folder: Path) -> None:
     def state() -> list[str]:
-        return page.run("['way', 'dots', 'say'].map(n => { const x = document.querySelector(`[data-em=${n}]`);"
-                        "return x.getAttribute('points') || x.getAttribute('d') || x.textContent; })")  # fmt: skip
+        return page.run(
+            "['way', 'dots', 'say'].map(n => { const x = document.querySelector(`[data-em=${n}]`);"
+            "return x.getAttribute('points') || x.getAttribute('d') || x.textContent; })"
+        )
 
     last = state()
     page.run("{ const s = document.querySelector('[data-em=slider]'); s.value = 0; s.dispatchEvent(new Event('input')); }")

@@ -99,9 +99,14 @@ def test_shape_is_drawn_without_holes_where_it_is() -> None:
 def associations(frames: list[int], labels: list[int]) -> RunAssociations:
     rows = np.array([k for k, j in enumerate(labels) if j >= 0])
     return RunAssociations(
-        tuple(map(str, range(len(frames)))), np.array(frames), rows, np.array(labels)[rows], np.ones(len(rows)),
-        np.zeros(len(frames)), np.zeros(len(frames)),
-    )  # fmt: skip
+        tuple(map(str, range(len(frames)))),
+        np.array(frames),
+        rows,
+        np.array(labels)[rows],
+        np.ones(len(rows)),
+        np.zeros(len(frames)),
+        np.zeros(len(frames)),
+    )
 
 
 def test_loops_are_the_returns_after_the_gap() -> None:
@@ -148,8 +153,15 @@ def test_markup_cannot_leave_attributes_tables_or_data() -> None:
 
 def test_numbers_are_said_shortly() -> None:
     assert [say(x) for x in (None, float("nan"), 0.0, 3, 0.123456, 1234.6, 1e-7, True)] == [
-        "–", "–", "0", "3", "0.1235", "1235", "1e-07", "yes",
-    ]  # fmt: skip
+        "–",
+        "–",
+        "0",
+        "3",
+        "0.1235",
+        "1235",
+        "1e-07",
+        "yes",
+    ]
 
 
 def test_detections_whose_truth_is_not_trusted_are_not_judged(run_folder: Path, tmp_path: Path) -> None:

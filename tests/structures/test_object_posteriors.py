@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.geometry.pose import quaternion_to_matrix, rotation_angle, so3_exp
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 UPRIGHT_AND_FACING_BACK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """R_camera_object of an object whose front (-y) looks along -z of the camera, its top (z) along -y."""
 
 
-def observations(**change: Any) -> Observations:
+def observations(**change: Any) -> ObjectPosteriors:
     """Two objects with three azimuth modes each."""
     n, modes = 2, 3
     values: dict[str, Any] = {
@@ -48,7 +48,7 @@ def observations(**change: Any) -> Observations:
     }
     values.update(change)
     assert values["viewpoint_modes"].weights.shape[1] == modes
-    return Observations(**values)
+    return ObjectPosteriors(**values)
 
 
 @pytest.mark.parametrize("bearing", [0.0, 0.9, -1.1])

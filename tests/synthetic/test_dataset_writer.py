@@ -75,9 +75,7 @@ def test_round_trip(source: SceneSource, written: Path) -> None:
     assert packed.shape == (len(folder.instances), 4096)
 
 
-def test_killed_run_is_resumed(
-    source: SceneSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_run_is_resumed(source: SceneSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dataset, "CHUNK", 3)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     write_scenes(whole, source, 8)
@@ -133,9 +131,15 @@ def test_other_scenes_are_not_mixed_in(source: SceneSource, written: Path, tmp_p
 
 def user_line(**changes: object) -> dict:
     thing = {
-        "box": [10, 20, 110, 60], "category": "car", "instance": "my car", "rotation": [0, 0, 0, 1],
-        "position": [0.1, 0.2, 5.0], "size": 4.5, "visibility": 0.5, "symmetry": 1,
-    }  # fmt: skip
+        "box": [10, 20, 110, 60],
+        "category": "car",
+        "instance": "my car",
+        "rotation": [0, 0, 0, 1],
+        "position": [0.1, 0.2, 5.0],
+        "size": 4.5,
+        "visibility": 0.5,
+        "symmetry": 1,
+    }
     line = {"image": "a.png", "intrinsics": [200, 210, 80, 50], "objects": [thing]}
     for field, value in changes.items():
         target = line if field in line else thing
@@ -189,7 +193,7 @@ def user(tmp_path: Path) -> Callable[..., Path]:
         (user_line(symmetry=-1), r":2: objects\[0\].symmetry: got -1"),
         (user_line(symmetry=1.5), r":2: objects\[0\].symmetry: got 1.5"),
     ],
-)  # fmt: skip
+)
 def test_malformed_lines(user: Callable[..., Path], line: dict | str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         SceneFolder(user(line), size=64)

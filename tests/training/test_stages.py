@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, SHAPE_STAGE, SceneElbo
+from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, SHAPE_STAGE, SceneELBO
 from nolbo_ppl.inference.svi import OptimisationConfig, restore, state_tensors
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.shape_vae import ShapeBatch
-from nolbo_ppl.training.stages import OBJECTIVES, Stage, StageRun, scene_weights, seeded_noise, shorten
+from nolbo_ppl.training.stages import OBJECTIVES, StageRun, TrainingStage, scene_weights, seeded_noise, shorten
 from nolbo_ppl.training.validation import held_out
 from tests.factories import random_batch, run_in_two_processes, tiny_config, tiny_model
 from tests.gloo_worker import local_batch, local_run, training
@@ -34,7 +34,7 @@ def test_frozen_parts_stay_bit_identical() -> None:
     config = tiny_config()
     model = tiny_model(config)
     weights = scene_weights("elbo", {"voxels": 0.01})
-    run = StageRun(model, Stage("scenes", QUICK, weights, freeze=2, decode=16))
+    run = StageRun(model, TrainingStage("scenes", QUICK, weights, freeze=2, decode=16))
     before = snapshot(model)
     for step in range(4):
         run.step(random_batch(config, seed=step))
@@ -54,7 +54,7 @@ def test_frozen_parts_stay_bit_identical() -> None:
 def test_a_stage_frozen_throughout_never_moves_the_story() -> None:
     config = tiny_config()
     model = tiny_model(config)
-    run = StageRun(model, Stage("single", QUICK, scene_weights("inclusive"), freeze=4))
+    run = StageRun(model, TrainingStage("single", QUICK, scene_weights("inclusive"), freeze=4))
     before = snapshot(model)
     for step in range(4):
         run.step(random_batch(config, seed=step))
@@ -64,7 +64,7 @@ def test_a_stage_frozen_throughout_never_moves_the_story() -> None:
 def test_stage_of_shapes_leaves_the_image_guide_alone() -> None:
     config = tiny_config()
     model = tiny_model(config)
-    run = StageRun(model, Stage("shapes", QUICK, {"shape_kl": 1.0, "voxels": 1.0}))
+    run = StageRun(model, TrainingStage("shapes", QUICK, {"shape_kl": 1.0, "voxels": 1.0}))
     before = snapshot(model)
     scene = random_batch(config, 1, 4)
     batch = ShapeBatch(scene.voxels[0], scene.category[0], scene.instance[0], scene.noise[0])
@@ -81,7 +81,7 @@ def test_the_label_of_a_shape_latent_by_bayes() -> None:
     model = tiny_model().eval()
     scene = random_batch(tiny_config(), 1, 4)
     batch = ShapeBatch(scene.voxels[0], scene.category[0], scene.instance[0], scene.noise[0])
-    terms = SceneElbo(SHAPE_STAGE).terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
+    terms = SceneELBO(SHAPE_STAGE).terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
     loc, scale = model.shape_guide.posterior(batch.voxels)
     z, mean = loc + scale * batch.noise, model.story.prior.category_mean()
     density = torch.distributions.MultivariateNormal(mean, torch.eye(mean.shape[1])).log_prob(z[:, None]).exp()
@@ -97,11 +97,11 @@ def test_the_label_of_a_shape_latent_keeps_categories_apart() -> None:
     for weight in (0.0, 50.0):
         model = tiny_model()
         weights = {"shape_kl": 1.0, "voxels": 0.01} | ({"shape_label": weight} if weight else {})
-        run = StageRun(model, Stage("shapes", replace(QUICK, steps=20), weights))
+        run = StageRun(model, TrainingStage("shapes", replace(QUICK, steps=20), weights))
         for _ in range(20):
             run.step(batch)
         model.eval()
-        elbo = SceneElbo(SHAPE_STAGE)
+        elbo = SceneELBO(SHAPE_STAGE)
         terms = elbo.terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
         certain[weight] = float(terms["shape_label"].detach())
     assert certain[50.0] > certain[0.0] + 0.1, certain
@@ -113,7 +113,7 @@ def test_every_objective_learns(objective: str) -> None:
     config = tiny_config()
     model = tiny_model(config)
     longer = OptimisationConfig(steps=12, learning_rate=5e-3, warmup=1, decay=0.0, ema=0.5)
-    run = StageRun(model, Stage("scenes", longer, scene_weights(objective, {"voxels": 0.0})))
+    run = StageRun(model, TrainingStage("scenes", longer, scene_weights(objective, {"voxels": 0.0})))
     batch = random_batch(config, 1, 2)
     losses = [run.step(batch).loss for _ in range(12)]
     assert losses[-1] < 0.95 * losses[0]
@@ -122,7 +122,7 @@ def test_every_objective_learns(objective: str) -> None:
 def test_the_average_is_adopted() -> None:
     config = tiny_config()
     model = tiny_model(config)
-    run = StageRun(model, Stage("scenes", QUICK, scene_weights("inclusive")))
+    run = StageRun(model, TrainingStage("scenes", QUICK, scene_weights("inclusive")))
     for step in range(3):
         run.step(random_batch(config, seed=step))
     copy = run.averaged()
@@ -140,7 +140,7 @@ def test_weights_of_objectives() -> None:
 
 
 def test_shorter_stages_freeze_in_proportion() -> None:
-    stage = shorten(Stage("scenes", OptimisationConfig(steps=1000), INCLUSIVE, freeze=400), 100)
+    stage = shorten(TrainingStage("scenes", OptimisationConfig(steps=1000), INCLUSIVE, freeze=400), 100)
     assert (stage.optimisation.steps, stage.freeze) == (100, 40)
 
 
@@ -177,9 +177,7 @@ def test_steps_made_alone_are_averaged(tmp_path: Path) -> None:
             continue
         states = [state_tensors(run.state) for run in runs]
         assert any(not torch.equal(states[0][name], states[1][name]) for name in states[0])
-        mean = {
-            name: (value + states[1][name]) / 2 if value.is_floating_point() else value for name, value in states[0].items()
-        }
+        mean = {name: (value + states[1][name]) / 2 if value.is_floating_point() else value for name, value in states[0].items()}
         for name, value in mean.items():
             assert torch.equal(first[f"{step}/{name}"], second[f"{step}/{name}"]), name
             torch.testing.assert_close(first[f"{step}/{name}"], value, atol=1e-9, rtol=1e-9, msg=name)

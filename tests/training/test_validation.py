@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.geometry.rotation import viewpoint_to_matrix
-from nolbo_ppl.inference.elbo import INCLUSIVE, SceneElbo
+from nolbo_ppl.inference.elbo import INCLUSIVE, SceneELBO
 from nolbo_ppl.models.guide import orientation_posterior
 from nolbo_ppl.models.scene_batch import decode_box
 from nolbo_ppl.training.validation import held_out
@@ -41,7 +41,7 @@ def test_figures_by_hand(form: str) -> None:
             scene = model.guide.observe(batch)
             for into, weights in ((bound, None), (inclusive, set(INCLUSIVE))):
                 kwargs = {"decode": 16}
-                for name, value in SceneElbo().terms(model.story, model.guide, scene, names=weights, **kwargs).items():
+                for name, value in SceneELBO().terms(model.story, model.guide, scene, names=weights, **kwargs).items():
                     into[name] = into.get(name, 0.0) + float(value) / 6
         q = scene.posterior
         mean = model.story.prior.category_mean().detach()

@@ -7,7 +7,7 @@ import torch
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import voxel_centres
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 
 @pytest.fixture
@@ -33,16 +33,29 @@ def observations(intrinsics):
     squared = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2
     inside = squared / np.array([0.1, 0.15, 0.2])[:, None, None, None]
     occupancy = 1 / (1 + np.exp(8 * (inside - 1)))
-    return Observations(
-        categories=CATEGORIES, objectness=np.array([0.9, 0.8, 0.4]), box=np.concatenate((pixel - 15, pixel + 15), 1),
-        box_scale=np.ones((n, 4)), class_log_posterior=log_posterior, class_log_likelihood=log_posterior,
-        instance_log_posterior=None, latent=rng.normal(size=(n, 16)), latent_scale=rng.uniform(0.1, 0.5, (n, 16)),
-        position=position, position_covariance=0.02 * position[:, 2, None, None] * np.eye(3),
+    return ObjectPosteriors(
+        categories=CATEGORIES,
+        objectness=np.array([0.9, 0.8, 0.4]),
+        box=np.concatenate((pixel - 15, pixel + 15), 1),
+        box_scale=np.ones((n, 4)),
+        class_log_posterior=log_posterior,
+        class_log_likelihood=log_posterior,
+        instance_log_posterior=None,
+        latent=rng.normal(size=(n, 16)),
+        latent_scale=rng.uniform(0.1, 0.5, (n, 16)),
+        position=position,
+        position_covariance=0.02 * position[:, 2, None, None] * np.eye(3),
         viewpoint_modes=ViewpointModes(
             np.array([[0.7, 0.3]] * n), viewpoint[:, :1] + np.array([0.0, np.pi]), np.full((n, 2), 25.0)
         ),
-        elevation_inplane=viewpoint[:, 1:], elevation_inplane_scale=np.full((n, 2), 0.1), viewpoint=viewpoint,
-        R_camera_object=R, rotation_scale=np.full(n, 0.1), diagonal=np.array([1.2, 1.4, 9.0]),
-        diagonal_log_scale=np.full(n, 0.1), size=np.array([[0.7, 0.7, 0.7], [0.9, 0.8, 0.7], [5.0, 5.0, 5.0]]),
-        voxel_mean=occupancy, voxel_variance=occupancy * (1 - occupancy),
-    )  # fmt: skip
+        elevation_inplane=viewpoint[:, 1:],
+        elevation_inplane_scale=np.full((n, 2), 0.1),
+        viewpoint=viewpoint,
+        R_camera_object=R,
+        rotation_scale=np.full(n, 0.1),
+        diagonal=np.array([1.2, 1.4, 9.0]),
+        diagonal_log_scale=np.full(n, 0.1),
+        size=np.array([[0.7, 0.7, 0.7], [0.9, 0.8, 0.7], [5.0, 5.0, 5.0]]),
+        voxel_mean=occupancy,
+        voxel_variance=occupancy * (1 - occupancy),
+    )

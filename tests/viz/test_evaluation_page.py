@@ -49,25 +49,38 @@ class Scenes:
         image = np.random.default_rng(index).integers(0, 256, (60, 200, 3), dtype=np.uint8)
         box = np.array([[10.0, 10, 50, 40], [60, 10, 100, 40]])
         return SceneTruth(
-            image, np.array([100.0, 100, 100, 30]), box, np.zeros(2, dtype=int), np.full((2, 3, 3), np.nan),
-            np.full((2, 3), np.nan), np.ones(2, dtype=int), np.ones(2), np.zeros((2, 4), np.uint8), np.full(2, np.nan),
+            image,
+            np.array([100.0, 100, 100, 30]),
+            box,
+            np.zeros(2, dtype=int),
+            np.full((2, 3, 3), np.nan),
+            np.full((2, 3), np.nan),
+            np.ones(2, dtype=int),
+            np.ones(2),
+            np.zeros((2, 4), np.uint8),
+            np.full(2, np.nan),
             np.array([[120.0, 10, 180, 50]]),
-        )  # fmt: skip
+        )
 
 
 class Model:
     def observe(self, images, intrinsics, *, threshold, decode):
         posterior = np.full((1, 12), 0.01)
         posterior[0, 5] = 0.89
-        return [SimpleNamespace(box=np.array([[12.0, 9, 52, 41]]), objectness=np.array([0.8]), class_posterior=posterior,
-                                categories=CATEGORIES)]  # fmt: skip
+        return [
+            SimpleNamespace(
+                box=np.array([[12.0, 9, 52, 41]]), objectness=np.array([0.8]), class_posterior=posterior, categories=CATEGORIES
+            )
+        ]
 
 
 def test_detections_are_drawn(tmp_path):
     figure = write_detections(found([2, 1, 0], [0, 1, 2], [0, 0, 0]), Scenes(), Model(), tmp_path / "detections.png")
     assert [axes.get_title() for axes in figure.axes] == [
-        "best: 2 to find, 0 mistakes", "median: 2 to find, 1 mistakes", "worst: 2 to find, 2 mistakes",
-    ]  # fmt: skip
+        "best: 2 to find, 0 mistakes",
+        "median: 2 to find, 1 mistakes",
+        "worst: 2 to find, 2 mistakes",
+    ]
     first = figure.axes[0]
     assert len(first.patches) == 1 + 2 + 1 and first.texts[0].get_text() == "car 0.80"
     assert (tmp_path / "detections.png").stat().st_size > 5000
@@ -91,12 +104,26 @@ def test_retrieval_is_drawn(tmp_path):
 def values(**changes):
     row = {"objects": 3, "ap50": 0.5, "acc_pi6": None}
     return {
-        "ap50": 0.512345, "acc_pi6": None, "intervals": {"ap50": [0.4, 0.6], "acc_pi6": None},
-        "counts": {"ap50": 12, "acc_pi6": 0}, "scenes": 7, "objects": 12, "by_category": {"car<b>": row, "bus": row},
-        "by_difficulty": {"under 24 px": row}, "retrieval": None, "versions": {"torch": "2"},
-        "configuration": {"model": "tiny & co", "scenes": None, "difficulty": "full", "seed": 5, "cad": None,
-                          "backgrounds": "photos"}, **changes,
-    }  # fmt: skip
+        "ap50": 0.512345,
+        "acc_pi6": None,
+        "intervals": {"ap50": [0.4, 0.6], "acc_pi6": None},
+        "counts": {"ap50": 12, "acc_pi6": 0},
+        "scenes": 7,
+        "objects": 12,
+        "by_category": {"car<b>": row, "bus": row},
+        "by_difficulty": {"under 24 px": row},
+        "retrieval": None,
+        "versions": {"torch": "2"},
+        "configuration": {
+            "model": "tiny & co",
+            "scenes": None,
+            "difficulty": "full",
+            "seed": 5,
+            "cad": None,
+            "backgrounds": "photos",
+        },
+        **changes,
+    }
 
 
 class Reader(HTMLParser):

@@ -53,9 +53,12 @@ def test_without_shapes_and_without_objects(image, observations, intrinsics, tmp
 
 def test_empty_shape_and_object_behind_the_camera(image, observations, intrinsics, tmp_path):
     odd = dataclasses.replace(
-        observations, voxel_mean=np.zeros_like(observations.voxel_mean), size=np.full((3, 3), 30.0),
-        latent=np.zeros((3, 128)), latent_scale=np.ones((3, 128)),
-    )  # fmt: skip
+        observations,
+        voxel_mean=np.zeros_like(observations.voxel_mean),
+        size=np.full((3, 3), 30.0),
+        latent=np.zeros((3, 128)),
+        latent_scale=np.ones((3, 128)),
+    )
     draw_observations(image, odd, intrinsics, path=tmp_path / "a.png")
     assert (tmp_path / "a.png").is_file()
 

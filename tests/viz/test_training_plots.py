@@ -15,8 +15,19 @@ def run_rows():
     shapes = {"stage": "shapes", "loss": 1.0, "terms/shape_kl": -3.0}
     rows = [{**shapes, "step": s, "terms/voxels": -100.0 / s} for s in (1, 2, 3)]
     rows += [{"stage": "scenes", "step": s, "loss": 2.0, "terms/box": -5.0, "learning_rate": 1e-3} for s in (1, 2)]
-    rows.append({"stage": "scenes", "step": 2, "bound/voxels": -50.0, "bound/box": 1.5, "bound": -48.5, "acc_pi6": 0.4,
-                 "inclusive/box": -2.0, "med_err_deg": 40.0, "box50": 0.9})  # fmt: skip
+    rows.append(
+        {
+            "stage": "scenes",
+            "step": 2,
+            "bound/voxels": -50.0,
+            "bound/box": 1.5,
+            "bound": -48.5,
+            "acc_pi6": 0.4,
+            "inclusive/box": -2.0,
+            "med_err_deg": 40.0,
+            "box50": 0.9,
+        }
+    )
     return rows
 
 

@@ -9,6 +9,10 @@ from nolbo_ppl.data.converters.kitti_tracking import convert_kitti_tracking
 from nolbo_ppl.data.converters.ycbv_slam import convert_ycbv_slam
 
 __all__ = [
-    "Converted", "convert_kitti_object", "convert_kitti_poles", "convert_kitti_tracking", "convert_ycbv_slam",
+    "Converted",
+    "convert_kitti_object",
+    "convert_kitti_poles",
+    "convert_kitti_tracking",
+    "convert_ycbv_slam",
     "write_converted",
-]  # fmt: skip
+]

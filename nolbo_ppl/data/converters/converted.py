@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, write_json
-from nolbo_ppl.io.observations import ObservationTable, write_observations
+from nolbo_ppl.io.observations import Detections, write_observations
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, write_trajectory
 
 
@@ -24,7 +24,7 @@ class Converted:
     """Drifting T_world_camera."""
     truth: Trajectory
     """True T_world_camera, row by row."""
-    observations: ObservationTable
+    observations: Detections
     """Detections."""
     objects: tuple[str | None, ...]
     """True object of each detection; None for clutter."""
@@ -49,11 +49,14 @@ def write_converted(out: str | PathLike[str], data: Converted) -> None:
         with atomic_path(out / COVARIANCE) as temporary:
             np.savez_compressed(temporary, covariance=data.odometry_covariance)
     write_observations(out / "observations.jsonl", data.observations)
-    write_json(out / "objects.json", {
-        "objects": dict(zip(data.observations.id, data.objects)),
-        "trusted": [bool(x) for x in data.trusted],
-        "T_world_object": {k: v.tolist() for k, v in data.T_world_object.items()},
-    })
+    write_json(
+        out / "objects.json",
+        {
+            "objects": dict(zip(data.observations.id, data.objects)),
+            "trusted": [bool(x) for x in data.trusted],
+            "T_world_object": {k: v.tolist() for k, v in data.T_world_object.items()},
+        },
+    )
     write_json(out / "source.json", data.source)
 
 

@@ -117,9 +117,7 @@ def read_object_labels(path: str | PathLike[str]) -> list[KittiLabel]:
         if len(values) != 14 or not np.isfinite(values).all():
             raise input_error("not a label", got=repr(text[:60]), expected="a type and 14 numbers", file=path, line=number)
         labels.append(
-            KittiLabel(
-                words[0], float(values[0]), int(values[1]), values[3:7], values[7:10], values[10:13], float(values[13])
-            )
+            KittiLabel(words[0], float(values[0]), int(values[1]), values[3:7], values[7:10], values[10:13], float(values[13]))
         )
     return labels
 
@@ -233,8 +231,9 @@ def convert_kitti_object(data: str | PathLike[str], out: str | PathLike[str]) ->
             shutil.copyfile(path, temporary)
     write_jsonl(out / SCENES, rows)
     counts = {
-        "images": len(rows), "objects": sum(len(row["objects"]) for row in rows),
+        "images": len(rows),
+        "objects": sum(len(row["objects"]) for row in rows),
         "ignore": sum(len(row["ignore"]) for row in rows),
-    }  # fmt: skip
+    }
     write_json(out / "source.json", {"kind": "kitti-object", **counts, "calibration": cameras})
     return counts

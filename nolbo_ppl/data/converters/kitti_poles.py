@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.data.converters.converted import Converted, existing
-from nolbo_ppl.data.simulate import DetectorConfig, World, simulate_detections
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedWorld, simulate_detections
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.observations import make_table
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
@@ -23,9 +23,18 @@ def pole_positions(poles: Float[np.ndarray, "m 2"], truth: Float[np.ndarray, "n 
 
 
 def convert_kitti_poles(
-    data: str | PathLike[str], sequence: str, *, odometry: str = "odometry_f2f", every: int = 1, seed: int = 0,
-    position_scale: float = 0.1, position_ratio: float = 0.03, miss_rate: float = 0.15, clutter_rate: float = 0.5,
-    maximum_range: float = 30.0, field_of_view: float = 2.0,
+    data: str | PathLike[str],
+    sequence: str,
+    *,
+    odometry: str = "odometry_f2f",
+    every: int = 1,
+    seed: int = 0,
+    position_scale: float = 0.1,
+    position_ratio: float = 0.03,
+    miss_rate: float = 0.15,
+    clutter_rate: float = 0.5,
+    maximum_range: float = 30.0,
+    field_of_view: float = 2.0,
 ) -> Converted:
     """Simulate position-only detections of the pole map of one drive.
 
@@ -52,21 +61,39 @@ def convert_kitti_poles(
     truth, drift = truth[::every], drift[::every]
     m = len(world)
     detector = DetectorConfig(
-        maximum_range=maximum_range, field_of_view=field_of_view, miss_rate=miss_rate, clutter_rate=clutter_rate,
-        position_scale=position_scale, position_ratio=position_ratio, rotation_scale=None,
+        maximum_range=maximum_range,
+        field_of_view=field_of_view,
+        miss_rate=miss_rate,
+        clutter_rate=clutter_rate,
+        position_scale=position_scale,
+        position_ratio=position_ratio,
+        rotation_scale=None,
     )
-    objects = World(world, np.tile(np.eye(3), (m, 1, 1)), np.zeros(m, np.int64), np.zeros((m, 0)), np.zeros((1, 0)))
+    objects = SimulatedWorld(world, np.tile(np.eye(3), (m, 1, 1)), np.zeros(m, np.int64), np.zeros((m, 0)), np.zeros((1, 0)))
     table, source = simulate_detections(truth, objects, detector, np.random.default_rng(seed))
-    plain = make_table(table.frame, table.position, position_covariance=table.position_covariance,
-                       category=["pole"] * len(table), id=table.id)
-    poses = {
-        f"pole-{j}": np.block([[np.eye(3), world[j][:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) for j in range(m)
+    plain = make_table(
+        table.frame, table.position, position_covariance=table.position_covariance, category=["pole"] * len(table), id=table.id
+    )
+    poses = {f"pole-{j}": np.block([[np.eye(3), world[j][:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) for j in range(m)}
+    settings = {
+        "kind": "kitti-poles",
+        "sequence": sequence,
+        "odometry": odometry,
+        "every": every,
+        "seed": seed,
+        "position_scale": position_scale,
+        "position_ratio": position_ratio,
+        "miss_rate": miss_rate,
+        "clutter_rate": clutter_rate,
+        "maximum_range": maximum_range,
+        "field_of_view": field_of_view,
     }
-    settings = {"kind": "kitti-poles", "sequence": sequence, "odometry": odometry, "every": every, "seed": seed,
-                "position_scale": position_scale, "position_ratio": position_ratio, "miss_rate": miss_rate,
-                "clutter_rate": clutter_rate, "maximum_range": maximum_range, "field_of_view": field_of_view}
     return Converted(
-        odometry=Trajectory(drift), truth=Trajectory(truth), observations=plain,
-        objects=tuple(f"pole-{j}" if j >= 0 else None for j in source), trusted=np.ones(len(truth), bool),
-        T_world_object=poses, source=settings,
+        odometry=Trajectory(drift),
+        truth=Trajectory(truth),
+        observations=plain,
+        objects=tuple(f"pole-{j}" if j >= 0 else None for j in source),
+        trusted=np.ones(len(truth), bool),
+        T_world_object=poses,
+        source=settings,
     )

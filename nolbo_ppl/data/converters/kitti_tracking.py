@@ -100,8 +100,15 @@ def parked_tracks(
 
 
 def convert_kitti_tracking(
-    data: str | PathLike[str], sequence: str, *, seed: int = 0, rotation_drift: float = np.deg2rad(0.3),
-    translation_drift: float = 0.02, minimum_score: float = 0.0, match_distance: float = 2.0, trusted_only: bool = True,
+    data: str | PathLike[str],
+    sequence: str,
+    *,
+    seed: int = 0,
+    rotation_drift: float = np.deg2rad(0.3),
+    translation_drift: float = 0.02,
+    minimum_score: float = 0.0,
+    match_distance: float = 2.0,
+    trusted_only: bool = True,
 ) -> Converted:
     """Real detections of one drive; odometry is the pseudo ego motion with seeded planar drift.
 
@@ -136,8 +143,13 @@ def convert_kitti_tracking(
     objectness = 1.0 / (1.0 + np.exp(-rows[:, 6]))
     counter = np.array([int(np.sum(frame[:i] == t)) for i, t in enumerate(frame)]) if len(frame) else frame
     table = make_table(
-        frame, position, rotation=car_rotation(rows[:, 13]), objectness=objectness, category=["car"] * len(rows),
-        size=np.stack([w, length, h], axis=1), id=[f"{t:06d}-{k:02d}" for t, k in zip(frame, counter)],
+        frame,
+        position,
+        rotation=car_rotation(rows[:, 13]),
+        objectness=objectness,
+        category=["car"] * len(rows),
+        size=np.stack([w, length, h], axis=1),
+        id=[f"{t:06d}-{k:02d}" for t, k in zip(frame, counter)],
     )
     parked = parked_tracks(numbers, poses, kinds, truth, trusted)
     objects: list[str | None] = []
@@ -150,10 +162,24 @@ def convert_kitti_tracking(
         else:
             track = int(numbers[best, 1])
             objects.append(f"{'car' if track in parked else 'moving'}-{track}")
-    odometry = simulate_odometry(truth, np.random.default_rng(seed), rotation_scale=rotation_drift,
-                                 translation_ratio=translation_drift, planar=True)
-    settings = {"kind": "kitti-tracking", "sequence": sequence, "seed": seed, "rotation_drift": rotation_drift,
-                "translation_drift": translation_drift, "minimum_score": minimum_score}
+    odometry = simulate_odometry(
+        truth, np.random.default_rng(seed), rotation_scale=rotation_drift, translation_ratio=translation_drift, planar=True
+    )
+    settings = {
+        "kind": "kitti-tracking",
+        "sequence": sequence,
+        "seed": seed,
+        "rotation_drift": rotation_drift,
+        "translation_drift": translation_drift,
+        "minimum_score": minimum_score,
+    }
     poses_out = {f"car-{k}": make_pose(np.eye(3), v) for k, v in parked.items()}
-    return Converted(odometry=Trajectory(odometry), truth=Trajectory(truth), observations=table, objects=tuple(objects),
-                     trusted=trusted, T_world_object=poses_out, source=settings)
+    return Converted(
+        odometry=Trajectory(odometry),
+        truth=Trajectory(truth),
+        observations=table,
+        objects=tuple(objects),
+        trusted=trusted,
+        T_world_object=poses_out,
+        source=settings,
+    )

@@ -37,8 +37,14 @@ def _skew(v: np.ndarray) -> np.ndarray:
 
 
 def convert_ycbv_slam(
-    data: str | PathLike[str], sequence: str, *, detections: str = "det_initial", every: int = 10, seed: int = 0,
-    rotation_drift: float = np.deg2rad(1.0), translation_drift: float = 0.005,
+    data: str | PathLike[str],
+    sequence: str,
+    *,
+    detections: str = "det_initial",
+    every: int = 10,
+    seed: int = 0,
+    rotation_drift: float = np.deg2rad(1.0),
+    translation_drift: float = 0.005,
 ) -> Converted:
     """Keyframes of one sequence; each odometry step between them gets seeded noise, which is stated as its covariance.
 
@@ -65,8 +71,9 @@ def convert_ycbv_slam(
     truth = poses_of(arrays["cam_gt"][keep])
     steps = relative(*(lambda T: (T[:-1], T[1:]))(poses_of(arrays["odom_est"][keep])))
     rng = np.random.default_rng(seed)
-    noise = np.concatenate([rotation_drift * rng.standard_normal((len(steps), 3)),
-                            translation_drift * rng.standard_normal((len(steps), 3))], axis=1)
+    noise = np.concatenate(
+        [rotation_drift * rng.standard_normal((len(steps), 3)), translation_drift * rng.standard_normal((len(steps), 3))], axis=1
+    )
     odometry = chain(truth[0], steps @ se3_exp(noise))
     frames, poses, labels, world = [], [], [], {}
     for name in names:
@@ -84,15 +91,28 @@ def convert_ycbv_slam(
     T = np.concatenate(poses)[order]
     labels = [labels[i] for i in order]
     frame = frame[order]
-    table = make_table(frame, T[:, :3, 3], rotation=T[:, :3, :3], category=labels,
-                       id=[f"{t:06d}-{name}" for t, name in zip(frame, labels)])
-    settings = {"kind": "ycbv-slam", "sequence": sequence, "detections": detections, "every": every, "seed": seed,
-                "rotation_drift": rotation_drift, "translation_drift": translation_drift}
+    table = make_table(
+        frame, T[:, :3, 3], rotation=T[:, :3, :3], category=labels, id=[f"{t:06d}-{name}" for t, name in zip(frame, labels)]
+    )
+    settings = {
+        "kind": "ycbv-slam",
+        "sequence": sequence,
+        "detections": detections,
+        "every": every,
+        "seed": seed,
+        "rotation_drift": rotation_drift,
+        "translation_drift": translation_drift,
+    }
     times = np.asarray(arrays["t"], dtype=np.float64)[keep]
     # The real odometry's own errors are far below the drift added to it.
     covariance = np.diag(np.repeat(np.maximum([rotation_drift, translation_drift], 1e-4) ** 2, 3))
     return Converted(
-        odometry=Trajectory(odometry, times, "tum"), truth=Trajectory(truth, times, "tum"), observations=table,
-        objects=tuple(labels), trusted=np.ones(len(keep), bool), T_world_object=world,
-        odometry_covariance=np.tile(covariance, (len(steps), 1, 1)), source=settings,
+        odometry=Trajectory(odometry, times, "tum"),
+        truth=Trajectory(truth, times, "tum"),
+        observations=table,
+        objects=tuple(labels),
+        trusted=np.ones(len(keep), bool),
+        T_world_object=world,
+        odometry_covariance=np.tile(covariance, (len(steps), 1, 1)),
+        source=settings,
     )

@@ -146,7 +146,10 @@ class ImageFolder(FrameSequence):
     """The images of a folder, in natural order of their names."""
 
     def __init__(
-        self, path: str | PathLike[str], files: Sequence[Path], times: Float[np.ndarray, " n"] | None = None,
+        self,
+        path: str | PathLike[str],
+        files: Sequence[Path],
+        times: Float[np.ndarray, " n"] | None = None,
         listing: tuple[Path, Sequence[int]] | None = None,
     ) -> None:
         """Frames in these files; `listing` is the file that lists them and the line of each, for messages."""
@@ -177,8 +180,12 @@ class ImageFolder(FrameSequence):
         image = self._read(k)
         found = image.shape[1], image.shape[0]
         if found != self.size:
-            raise input_error("image of another size", got=f"{found[0]} x {found[1]} px",
-                              expected=f"{self.size[0]} x {self.size[1]} px as the first", file=self.files[k])
+            raise input_error(
+                "image of another size",
+                got=f"{found[0]} x {found[1]} px",
+                expected=f"{self.size[0]} x {self.size[1]} px as the first",
+                file=self.files[k],
+            )
         return image
 
     def time(self, k: int, /) -> float | None:
@@ -203,8 +210,9 @@ def read_listing(path: Path) -> tuple[list[int], Float[np.ndarray, " n"], list[P
         except ValueError:
             stamp = float("nan")
         if len(words) != 2 or not np.isfinite(stamp):
-            raise input_error("not a row of a TUM list", got=repr(" ".join(words)[:80]), expected="`time file`",
-                              file=path, line=number)
+            raise input_error(
+                "not a row of a TUM list", got=repr(" ".join(words)[:80]), expected="`time file`", file=path, line=number
+            )
         if times and stamp <= times[-1]:
             raise input_error("time does not increase", got=words[0], file=path, line=number)
         file = path.parent / words[1]

@@ -27,8 +27,13 @@ def find_times(folder: Path, top: Path, count: int) -> Float[np.ndarray, " n"] |
         if file.is_file():
             times = read_times(file)
             if len(times) != count:
-                raise input_error("times do not match the images", got=f"{len(times)} times",
-                                  expected=f"{count} images in {folder}", do="remove the file to go without times", file=file)
+                raise input_error(
+                    "times do not match the images",
+                    got=f"{len(times)} times",
+                    expected=f"{count} images in {folder}",
+                    do="remove the file to go without times",
+                    file=file,
+                )
             return times
     return None
 
@@ -42,8 +47,12 @@ def open_frames(path: str | PathLike[str]) -> FrameSequence:
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() not in VIDEO_SUFFIXES:
-            raise input_error("not a sequence of frames", got=path.name, expected="a folder, or a video ("
-                              + ", ".join(VIDEO_SUFFIXES) + ")", file=path)
+            raise input_error(
+                "not a sequence of frames",
+                got=path.name,
+                expected="a folder, or a video (" + ", ".join(VIDEO_SUFFIXES) + ")",
+                file=path,
+            )
         return VideoFile(path)
     if not path.is_dir():
         raise input_error("no such folder or video", file=path)
@@ -54,5 +63,6 @@ def open_frames(path: str | PathLike[str]) -> FrameSequence:
         files = list_frames(folder) if folder.is_dir() else []
         if files:
             return ImageFolder(path, files, find_times(folder, path, len(files)))
-    raise input_error("no image in the folder", expected="images in it, in " + ", ".join(IMAGE_FOLDERS) + ", or rgb.txt (TUM)",
-                      file=path)
+    raise input_error(
+        "no image in the folder", expected="images in it, in " + ", ".join(IMAGE_FOLDERS) + ", or rgb.txt (TUM)", file=path
+    )

@@ -48,9 +48,18 @@ class Association:
 
 @njit(cache=True, nogil=True)
 def _place(
-    row: int, values: np.ndarray, null: np.ndarray, u: np.ndarray, v: np.ndarray, match: np.ndarray,
-    owner: np.ndarray, distance: np.ndarray, previous: np.ndarray, reached: np.ndarray, order: np.ndarray,
-) -> bool:  # fmt: skip
+    row: int,
+    values: np.ndarray,
+    null: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    match: np.ndarray,
+    owner: np.ndarray,
+    distance: np.ndarray,
+    previous: np.ndarray,
+    reached: np.ndarray,
+    order: np.ndarray,
+) -> bool:
     """Place one more detection along the shortest alternating path (Dijkstra on slacks); False when there is none.
 
     Each detection ends a path by its own null, each free landmark by itself. Ties go to what was found first.
@@ -104,10 +113,17 @@ def _place(
 
 @njit(cache=True, nogil=True)
 def _assign(
-    log_likelihood: np.ndarray, log_null: np.ndarray, row_start: np.ndarray, column_start: np.ndarray,
-    cell_start: np.ndarray, u: np.ndarray, v: np.ndarray, match: np.ndarray, log_weight: np.ndarray,
+    log_likelihood: np.ndarray,
+    log_null: np.ndarray,
+    row_start: np.ndarray,
+    column_start: np.ndarray,
+    cell_start: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    match: np.ndarray,
+    log_weight: np.ndarray,
     failed: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """Best association of every frame; `failed[f]` is the detection that could not be placed, or -1."""
     widest = 0
     for frame in range(failed.shape[0]):
@@ -154,9 +170,17 @@ def try_assign(frames: Frames) -> tuple[BestAssignments, Int[np.ndarray, " frame
     )
     failed = np.empty(count, dtype=np.int64)
     _assign(
-        frames.log_likelihood, frames.log_null, frames.row_start, frames.column_start, frames.cell_start,
-        best.row_potential, best.column_potential, best.match, best.log_weight, failed,
-    )  # fmt: skip
+        frames.log_likelihood,
+        frames.log_null,
+        frames.row_start,
+        frames.column_start,
+        frames.cell_start,
+        best.row_potential,
+        best.column_potential,
+        best.match,
+        best.log_weight,
+        failed,
+    )
     return best, failed
 
 

@@ -45,9 +45,15 @@ class Components:
 
 @njit(cache=True, nogil=True)
 def _explore(
-    start: int, edges: np.ndarray, mark: int, row_mark: np.ndarray, column_mark: np.ndarray, queue: np.ndarray,
-    rows: np.ndarray, columns: np.ndarray,
-) -> tuple[int, int, int]:  # fmt: skip
+    start: int,
+    edges: np.ndarray,
+    mark: int,
+    row_mark: np.ndarray,
+    column_mark: np.ndarray,
+    queue: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+) -> tuple[int, int, int]:
     """Breadth-first search from node `start` (a row i, or n + j for column j).
 
     Fills `rows` and `columns` in the order of discovery; returns their counts and the last node found.
@@ -108,11 +114,22 @@ def _frontier(edges: np.ndarray, steps: np.ndarray, members: np.ndarray, transpo
 
 @njit(cache=True, nogil=True)
 def _split(
-    log_likelihood: np.ndarray, row_start: np.ndarray, column_start: np.ndarray, cell_start: np.ndarray,
-    u: np.ndarray, v: np.ndarray, smallest: float, frame_of: np.ndarray, component_rows: np.ndarray,
-    rows: np.ndarray, component_columns: np.ndarray, columns: np.ndarray, over_rows: np.ndarray,
-    states: np.ndarray, frontier: np.ndarray,
-) -> int:  # fmt: skip
+    log_likelihood: np.ndarray,
+    row_start: np.ndarray,
+    column_start: np.ndarray,
+    cell_start: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    smallest: float,
+    frame_of: np.ndarray,
+    component_rows: np.ndarray,
+    rows: np.ndarray,
+    component_columns: np.ndarray,
+    columns: np.ndarray,
+    over_rows: np.ndarray,
+    states: np.ndarray,
+    frontier: np.ndarray,
+) -> int:
     """Find the components of every frame, fill the arrays of `Components`, return how many there are."""
     count = 0
     component_rows[0] = 0
@@ -132,9 +149,7 @@ def _split(
             if row_mark[row] >= 0:
                 continue
             row_slice, column_slice = rows[component_rows[count] :], columns[component_columns[count] :]
-            found_rows, found_columns, end = _explore(
-                row, edges, mark, row_mark, column_mark, queue, row_slice, column_slice
-            )
+            found_rows, found_columns, end = _explore(row, edges, mark, row_mark, column_mark, queue, row_slice, column_slice)
             if min(found_rows, found_columns) > 3:  # start again from one end, as the frontier is narrower from there
                 _explore(end, edges, mark + 1, row_mark, column_mark, queue, row_slice, column_slice)
             mark += 2
@@ -161,14 +176,32 @@ def split_components(frames: Frames, best: BestAssignments, gate: float) -> Comp
     over_rows, states = np.empty(detections, dtype=np.bool_), np.empty(detections)
     frontier = np.empty(detections, dtype=np.int64)
     count = _split(
-        frames.log_likelihood, frames.row_start, frames.column_start, frames.cell_start, best.row_potential,
-        best.column_potential, smallest_log(gate), frame, row_start, rows, column_start, columns, over_rows, states,
+        frames.log_likelihood,
+        frames.row_start,
+        frames.column_start,
+        frames.cell_start,
+        best.row_potential,
+        best.column_potential,
+        smallest_log(gate),
+        frame,
+        row_start,
+        rows,
+        column_start,
+        columns,
+        over_rows,
+        states,
         frontier,
-    )  # fmt: skip
+    )
     return Components(
-        frame[:count], row_start[: count + 1], rows, column_start[: count + 1], columns[: column_start[count]],
-        over_rows[:count], states[:count], frontier[:count],
-    )  # fmt: skip
+        frame[:count],
+        row_start[: count + 1],
+        rows,
+        column_start[: count + 1],
+        columns[: column_start[count]],
+        over_rows[:count],
+        states[:count],
+        frontier[:count],
+    )
 
 
 def smallest_log(gate: float) -> float:

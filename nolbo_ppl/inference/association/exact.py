@@ -52,11 +52,27 @@ def sum_associations(frames: Frames, *, budget: int, gate: float) -> FrameSums:
         residual=np.full(len(frames), np.nan),
     )
     sum_frames(
-        frames.log_likelihood, frames.log_null, frames.row_start, frames.column_start, frames.cell_start,
-        best.row_potential, best.column_potential, components.frame, components.row_start, components.rows,
-        components.column_start, components.columns, components.over_rows, components.states, components.frontier,
-        float(budget), smallest_log(gate), sums.weights, sums.null, sums.log_evidence,
-    )  # fmt: skip
+        frames.log_likelihood,
+        frames.log_null,
+        frames.row_start,
+        frames.column_start,
+        frames.cell_start,
+        best.row_potential,
+        best.column_potential,
+        components.frame,
+        components.row_start,
+        components.rows,
+        components.column_start,
+        components.columns,
+        components.over_rows,
+        components.states,
+        components.frontier,
+        float(budget),
+        smallest_log(gate),
+        sums.weights,
+        sums.null,
+        sums.log_evidence,
+    )
     for component in np.flatnonzero(components.states > budget):
         _propagate_component(frames, best, components, int(component), smallest_log(gate), sums)
     return sums
@@ -70,10 +86,15 @@ def _propagate_component(
     rows = components.rows[components.row_start[component] : components.row_start[component + 1]]
     columns = components.columns[components.column_start[component] : components.column_start[component + 1]]
     reduced, alone_column, alone_row = gather(
-        frames.matrix(frames.log_likelihood, frame), frames.rows(frames.log_null, frame),
-        frames.rows(best.row_potential, frame), frames.columns(best.column_potential, frame),
-        rows, columns, False, smallest,
-    )  # fmt: skip
+        frames.matrix(frames.log_likelihood, frame),
+        frames.rows(frames.log_null, frame),
+        frames.rows(best.row_potential, frame),
+        frames.columns(best.column_potential, frame),
+        rows,
+        columns,
+        False,
+        smallest,
+    )
     weights, null = np.empty(reduced.shape), np.empty(len(rows))
     log_evidence, residual, _ = propagate(reduced, alone_row, alone_column, ITERATIONS, TOLERANCE, weights, null)
     frames.matrix(sums.weights, frame)[np.ix_(rows, columns)] = weights

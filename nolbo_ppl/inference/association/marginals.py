@@ -147,17 +147,13 @@ def _hungarian(frames: Frames) -> list[AssociationMarginals]:
         weights = np.zeros(frames.shape(frame))
         placed = np.flatnonzero(match >= 0)
         weights[placed, match[placed]] = 1.0
-        results.append(
-            AssociationMarginals(weights, (match < 0).astype(float), float(best.log_weight[frame]), False, None)
-        )
+        results.append(AssociationMarginals(weights, (match < 0).astype(float), float(best.log_weight[frame]), False, None))
     return results
 
 
 def _k_best(frames: Frames, frame: int, k: int) -> AssociationMarginals:
     """The k best associations, renormalised; the evidence is their sum, a lower bound. Exact when there are no more."""
-    listed = k_best_associations(
-        frames.matrix(frames.log_likelihood, frame), frames.rows(frames.log_null, frame), k + 1
-    )
+    listed = k_best_associations(frames.matrix(frames.log_likelihood, frame), frames.rows(frames.log_null, frame), k + 1)
     kept = listed[:k]
     logs = np.array([association.log_weight for association in kept])
     odds = np.exp(logs - logs[0])

@@ -19,9 +19,14 @@ FLOOR = 1e-150
 
 @njit(cache=True, nogil=True)
 def propagate(
-    reduced: np.ndarray, alone_row: np.ndarray, alone_column: np.ndarray, iterations: int, tolerance: float,
-    weights: np.ndarray, null: np.ndarray,
-) -> tuple[float, float, int]:  # fmt: skip
+    reduced: np.ndarray,
+    alone_row: np.ndarray,
+    alone_column: np.ndarray,
+    iterations: int,
+    tolerance: float,
+    weights: np.ndarray,
+    null: np.ndarray,
+) -> tuple[float, float, int]:
     """Belief propagation on reduced weights [n, m]; fills the marginals `weights` [n, m] and `null` [n].
 
     Returns Bethe's log evidence (relative to the potentials), the residual (the largest difference between what

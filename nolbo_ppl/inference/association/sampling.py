@@ -17,9 +17,16 @@ from nolbo_ppl.inference.association.subsets import backward_component, gather
 
 @njit(cache=True, nogil=True)
 def _draw(
-    weights: np.ndarray, alone_step: np.ndarray, store: np.ndarray, offset: np.ndarray, width: np.ndarray,
-    slots: np.ndarray, last: np.ndarray, uniform: np.ndarray, taken: np.ndarray,
-) -> None:  # fmt: skip
+    weights: np.ndarray,
+    alone_step: np.ndarray,
+    store: np.ndarray,
+    offset: np.ndarray,
+    width: np.ndarray,
+    slots: np.ndarray,
+    last: np.ndarray,
+    uniform: np.ndarray,
+    taken: np.ndarray,
+) -> None:
     """Draw the member of every step, -1 for none: taken [count, step], by inversion of uniform [count, step].
 
     Given the set S taken so far, step t takes s with probability r_ts G_{t+1}[S + s], or none with b_t G_{t+1}[S].
@@ -99,9 +106,15 @@ def sample_associations(
             )
         over_rows = bool(components.over_rows[c])
         weights, alone_member, alone_step = gather(
-            frames.matrix(frames.log_likelihood, 0), frames.log_null, best.row_potential, best.column_potential,
-            rows, columns, over_rows, smallest_log(gate),
-        )  # fmt: skip
+            frames.matrix(frames.log_likelihood, 0),
+            frames.log_null,
+            best.row_potential,
+            best.column_potential,
+            rows,
+            columns,
+            over_rows,
+            smallest_log(gate),
+        )
         taken = np.empty((count, len(weights)), dtype=np.int64)
         store, offset, width, slots, last = backward_component(weights, alone_member, alone_step)
         _draw(weights, alone_step, store, offset, width, slots, last, rng.random(taken.shape), taken)

@@ -25,9 +25,15 @@ _FAST = {"reassoc", "contract", "nsz"}
 
 @njit(cache=True, nogil=True)
 def gather(
-    values: np.ndarray, null: np.ndarray, u: np.ndarray, v: np.ndarray, rows: np.ndarray, columns: np.ndarray,
-    over_rows: bool, smallest: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    values: np.ndarray,
+    null: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    over_rows: bool,
+    smallest: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reduced weights of a component: weights [step, member], alone_member, alone_step."""
     n, m = rows.shape[0], columns.shape[0]
     weights = np.zeros((m, n)) if over_rows else np.zeros((n, m))
@@ -97,8 +103,14 @@ def _take_step(before: np.ndarray, after: np.ndarray, width: int, slots: np.ndar
         for block in range(size >> 3):
             s = 8 * block
             f0, f1, f2, f3, f4, f5, f6 = (
-                before[s], before[s + 1], before[s + 2], before[s + 3], before[s + 4], before[s + 5], before[s + 6],
-            )  # fmt: skip
+                before[s],
+                before[s + 1],
+                before[s + 2],
+                before[s + 3],
+                before[s + 4],
+                before[s + 5],
+                before[s + 6],
+            )
             after[s] = b * f0
             after[s + 1] = b * f1 + r0 * f0
             after[s + 2] = b * f2 + r1 * f0
@@ -120,9 +132,16 @@ def _take_step(before: np.ndarray, after: np.ndarray, width: int, slots: np.ndar
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
 def _undo_step(
-    before: np.ndarray, ahead: np.ndarray, behind: np.ndarray, width: int, slots: np.ndarray, r: np.ndarray, b: float,
-    evidence: float, marginal: np.ndarray,
-) -> float:  # fmt: skip
+    before: np.ndarray,
+    ahead: np.ndarray,
+    behind: np.ndarray,
+    width: int,
+    slots: np.ndarray,
+    r: np.ndarray,
+    b: float,
+    evidence: float,
+    marginal: np.ndarray,
+) -> float:
     """Backward recursion of one step: `behind` (G_t) from `ahead` (G_{t+1}), with the marginals of the step.
 
     Fills marginal[member]; returns sum_S F_t[S] G_{t+1}[S] / Z, which times b is the probability of staying alone.
@@ -139,12 +158,24 @@ def _undo_step(
         for block in range(size >> 3):
             s = 8 * block
             f0, f1, f2, f3, f4, f5, f6 = (
-                before[s], before[s + 1], before[s + 2], before[s + 3], before[s + 4], before[s + 5], before[s + 6],
-            )  # fmt: skip
+                before[s],
+                before[s + 1],
+                before[s + 2],
+                before[s + 3],
+                before[s + 4],
+                before[s + 5],
+                before[s + 6],
+            )
             g0, g1, g2, g3, g4, g5, g6, g7 = (
-                ahead[s], ahead[s + 1], ahead[s + 2], ahead[s + 3], ahead[s + 4], ahead[s + 5], ahead[s + 6],
+                ahead[s],
+                ahead[s + 1],
+                ahead[s + 2],
+                ahead[s + 3],
+                ahead[s + 4],
+                ahead[s + 5],
+                ahead[s + 6],
                 ahead[s + 7],
-            )  # fmt: skip
+            )
             behind[s] = b * g0 + r0 * g1 + r1 * g2 + r2 * g4
             behind[s + 1] = b * g1 + r1 * g3 + r2 * g5
             behind[s + 2] = b * g2 + r0 * g3 + r2 * g6
@@ -218,9 +249,16 @@ def _close_all(
 
 @njit(cache=True, nogil=True)
 def _forward(
-    weights: np.ndarray, alone_member: np.ndarray, alone_step: np.ndarray, last: np.ndarray, width: np.ndarray,
-    slots: np.ndarray, offset: np.ndarray, store: np.ndarray, chain: np.ndarray,
-) -> float:  # fmt: skip
+    weights: np.ndarray,
+    alone_member: np.ndarray,
+    alone_step: np.ndarray,
+    last: np.ndarray,
+    width: np.ndarray,
+    slots: np.ndarray,
+    offset: np.ndarray,
+    store: np.ndarray,
+    chain: np.ndarray,
+) -> float:
     """Forward pass: F before every step into `store`; returns Z, in [1, number of associations]."""
     steps = weights.shape[0]
     kept, at = 1, 0
@@ -240,9 +278,17 @@ def _forward(
 
 @njit(cache=True, nogil=True)
 def sum_component(
-    weights: np.ndarray, alone_member: np.ndarray, alone_step: np.ndarray, store: np.ndarray, chain: np.ndarray,
-    ahead: np.ndarray, behind: np.ndarray, marginal: np.ndarray, idle_member: np.ndarray, idle_step: np.ndarray,
-) -> float:  # fmt: skip
+    weights: np.ndarray,
+    alone_member: np.ndarray,
+    alone_step: np.ndarray,
+    store: np.ndarray,
+    chain: np.ndarray,
+    ahead: np.ndarray,
+    behind: np.ndarray,
+    marginal: np.ndarray,
+    idle_member: np.ndarray,
+    idle_step: np.ndarray,
+) -> float:
     """Z of a component, its marginals [step, member], and the probabilities of every member and step to stay alone.
 
     `store` holds offset[-1] entries, `chain` and `ahead` 2^(frontier + 1), `behind` 2^frontier.
@@ -285,12 +331,27 @@ def sum_component(
 
 @njit(cache=True, nogil=True)
 def sum_frames(
-    log_likelihood: np.ndarray, log_null: np.ndarray, row_start: np.ndarray, column_start: np.ndarray,
-    cell_start: np.ndarray, u: np.ndarray, v: np.ndarray, frame_of: np.ndarray, component_rows: np.ndarray,
-    rows: np.ndarray, component_columns: np.ndarray, columns: np.ndarray, over_rows: np.ndarray,
-    states: np.ndarray, frontier: np.ndarray, budget: float, smallest: float, weights: np.ndarray,
-    null: np.ndarray, log_evidence: np.ndarray,
-) -> None:  # fmt: skip
+    log_likelihood: np.ndarray,
+    log_null: np.ndarray,
+    row_start: np.ndarray,
+    column_start: np.ndarray,
+    cell_start: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    frame_of: np.ndarray,
+    component_rows: np.ndarray,
+    rows: np.ndarray,
+    component_columns: np.ndarray,
+    columns: np.ndarray,
+    over_rows: np.ndarray,
+    states: np.ndarray,
+    frontier: np.ndarray,
+    budget: float,
+    smallest: float,
+    weights: np.ndarray,
+    null: np.ndarray,
+    log_evidence: np.ndarray,
+) -> None:
     """Sum every component within the budget (in states): scatter its marginals, add log Z to its frame's evidence."""
     most, widest = 1, 0
     for c in range(frame_of.shape[0]):
@@ -310,14 +371,18 @@ def sum_frames(
         ours = rows[component_rows[c] : component_rows[c + 1]]
         theirs = columns[component_columns[c] : component_columns[c + 1]]
         reduced, alone_member, alone_step = gather(
-            values, null_in, u[row_start[frame] : row_start[frame + 1]],
-            v[column_start[frame] : column_start[frame + 1]], ours, theirs, over_rows[c], smallest,
-        )  # fmt: skip
+            values,
+            null_in,
+            u[row_start[frame] : row_start[frame + 1]],
+            v[column_start[frame] : column_start[frame + 1]],
+            ours,
+            theirs,
+            over_rows[c],
+            smallest,
+        )
         marginal = np.empty_like(reduced)
         idle_member, idle_step = np.empty(reduced.shape[1]), np.empty(reduced.shape[0])
-        evidence = sum_component(
-            reduced, alone_member, alone_step, store, chain, ahead, behind, marginal, idle_member, idle_step
-        )
+        evidence = sum_component(reduced, alone_member, alone_step, store, chain, ahead, behind, marginal, idle_member, idle_step)
         log_evidence[frame] += np.log(evidence)
         for i in range(ours.shape[0]):
             null_out[ours[i]] = idle_member[i] if over_rows[c] else idle_step[i]

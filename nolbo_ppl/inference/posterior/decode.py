@@ -1,4 +1,4 @@
-"""From posterior parameters of regions to `Observations`: latent units become px, metres, radians and probabilities."""
+"""From posterior parameters of regions to `ObjectPosteriors`: latent units become px, metres, radians and probabilities."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import decode_box, decode_range
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 
 @dataclass(frozen=True)
-class Regions:
+class SelectedRegions:
     """Regions of a batch of images to answer for."""
 
     q: RegionParameters
@@ -40,9 +40,12 @@ class Regions:
 
 
 def assemble(
-    regions: Regions, config: ModelConfig, prior: LabelPrior, prior_mean: Float[Tensor, "labels d"],
+    regions: SelectedRegions,
+    config: ModelConfig,
+    prior: LabelPrior,
+    prior_mean: Float[Tensor, "labels d"],
     shapes: Callable[[RegionParameters, Float[Tensor, " n"]], ShapeAnswer],
-) -> Observations:
+) -> ObjectPosteriors:
     """Everything the posterior of some regions says.
 
     Args:
@@ -58,7 +61,7 @@ def assemble(
     position, diagonal = decode_range(q.range_loc, box, camera, config)
     azimuth = VonMisesMixture(
         q.azimuth_logits, q.azimuth_natural, max_concentration=config.max_concentration, validate_args=False
-    )  # fmt: skip
+    )
     # Sharp modes sit at a component's mean, a candidate of its own: a coarse grid finds the broad ones.
     viewpoint = torch.cat((azimuth.find_mode(grid=90)[:, None], q.angle_loc), -1)
     R = allocentric_to_egocentric(viewpoint_to_matrix(viewpoint), position)
@@ -66,7 +69,7 @@ def assemble(
     azimuth_variance = 1 / torch.gather(azimuth.concentration, -1, best)[:, 0].clamp_min(0.1)
     rotation_variance = (azimuth_variance + q.angle_scale.square().sum(-1)) / 3
     voxel_mean, voxel_variance, size = shapes(q, diagonal)
-    return Observations(
+    return ObjectPosteriors(
         categories=config.categories,
         objectness=torch.sigmoid(regions.logit.double()).numpy(),
         box=box.numpy() / np.tile(scale, 2),
@@ -117,8 +120,12 @@ def instance_log_posterior(q: RegionParameters, prior: LabelPrior) -> Float[np.n
 
 
 def position_covariance(
-    q: RegionParameters, box: Float[Tensor, "n 4"], box_scale: Float[Tensor, "n 4"], position: Float[Tensor, "n 3"],
-    camera: Float[Tensor, "n 4"], config: ModelConfig,
+    q: RegionParameters,
+    box: Float[Tensor, "n 4"],
+    box_scale: Float[Tensor, "n 4"],
+    position: Float[Tensor, "n 3"],
+    camera: Float[Tensor, "n 4"],
+    config: ModelConfig,
 ) -> Float[Tensor, "n 3 3"]:
     """Covariance of the position, m^2, float64, to first order: along the ray from the range, across it from the centre's pixel.
 

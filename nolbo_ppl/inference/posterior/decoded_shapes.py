@@ -35,8 +35,13 @@ def decode_latents(decoder: Decoder, latent: Float[Tensor, "n d"]) -> Float[np.n
 
 
 def sampled_shapes(
-    decoder: Decoder, voxel_size: int, loc: Float[Tensor, "n d"], scale: Float[Tensor, "n d"],
-    diagonal: Float[np.ndarray, " n"], samples: int, seed: int,
+    decoder: Decoder,
+    voxel_size: int,
+    loc: Float[Tensor, "n d"],
+    scale: Float[Tensor, "n d"],
+    diagonal: Float[np.ndarray, " n"],
+    samples: int,
+    seed: int,
 ) -> ShapeAnswer:
     """Mean and variance of the voxels over `N(loc, scale^2)`, and extents of the shape at `loc`.
 

@@ -29,7 +29,8 @@ def load(name_or_path: str | PathLike[str] = "tiny") -> ObservationModel:
     if not (folder / "config.json").is_file():
         names = sorted(path.parent.name for path in shipped.glob("*/config.json"))
         raise input_error(
-            "no such model", got=repr(str(name_or_path)),
+            "no such model",
+            got=repr(str(name_or_path)),
             expected=f"one of {names}, or a folder with config.json and model.safetensors",
         )
     values = read_json(folder / "config.json")
@@ -41,9 +42,7 @@ def load(name_or_path: str | PathLike[str] = "tiny") -> ObservationModel:
     return ObservationModel(model, Calibration.from_json(values.get("calibration", {})))
 
 
-def save(
-    folder: str | PathLike[str], model: Nolbo, calibration: Calibration, meta: dict[str, Any], half: bool = False
-) -> None:
+def save(folder: str | PathLike[str], model: Nolbo, calibration: Calibration, meta: dict[str, Any], half: bool = False) -> None:
     """Write a folder that `load` reads: `model.safetensors` and `config.json`.
 
     Args:
@@ -59,6 +58,4 @@ def save(
         for name, value in model.state_dict().items()
     }
     save_tensors(folder / "model.safetensors", tensors, {"format": 1})
-    write_json(
-        folder / "config.json", {"model": model.config.to_json(), "calibration": calibration.to_json(), **meta}
-    )
+    write_json(folder / "config.json", {"model": model.config.to_json(), "calibration": calibration.to_json(), **meta})

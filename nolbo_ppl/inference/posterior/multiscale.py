@@ -18,13 +18,13 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import nms
 from nolbo_ppl.inference.posterior.predictor import Image, ObservationModel
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 TRAINED_SIDES = (0.11, 0.94)
 """Longer sides of boxes the network has seen in training, as shares of its image size (14 to 120 px of 128)."""
 
 
-class Pyramid:
+class MultiScalePredictor:
     """A model that looks at every image in several sizes; it answers as `ObservationModel` does.
 
     Args:
@@ -43,16 +43,22 @@ class Pyramid:
         self.decode, self.shape_posterior, self.prior_mean = model.decode, model.shape_posterior, model.prior_mean
 
     def observe(
-        self, images: Sequence[Image], intrinsics: Any = None, *, threshold: float = 0.3, iou_threshold: float = 0.45,
-        decode: bool = True, batch: int = 16,
-    ) -> list[Observations]:
+        self,
+        images: Sequence[Image],
+        intrinsics: Any = None,
+        *,
+        threshold: float = 0.3,
+        iou_threshold: float = 0.45,
+        decode: bool = True,
+        batch: int = 16,
+    ) -> list[ObjectPosteriors]:
         """Posterior of every object of each image, best objectness first."""
         levels = [
             self.model.observe(
                 images, intrinsics, threshold=threshold, iou_threshold=iou_threshold, decode=decode, batch=batch, size=size
             )
             for size in self.sizes
-        ]  # fmt: skip
+        ]
         merged = []
         for image, found in zip(images, zip(*levels)):
             shown = [one[self._shown(side_of(one.box), level, image)] for level, one in enumerate(found)]
@@ -62,18 +68,27 @@ class Pyramid:
         return merged
 
     def observe_boxes(
-        self, images: Sequence[Image], intrinsics: Any, boxes: Sequence[Float[np.ndarray, "n 4"]], *, decode: bool = True,
+        self,
+        images: Sequence[Image],
+        intrinsics: Any,
+        boxes: Sequence[Float[np.ndarray, "n 4"]],
+        *,
+        decode: bool = True,
         batch: int = 16,
-    ) -> list[Observations]:
+    ) -> list[ObjectPosteriors]:
         """Posterior of the region responsible for each given box, at the size that shows it best."""
         best = [self._best(side_of(np.asarray(box).reshape(-1, 4)), image) for box, image in zip(boxes, images)]
         levels = [
             self.model.observe_boxes(
-                images, intrinsics, [np.asarray(box).reshape(-1, 4)[at == level] for box, at in zip(boxes, best)],
-                decode=decode, batch=batch, size=size,
+                images,
+                intrinsics,
+                [np.asarray(box).reshape(-1, 4)[at == level] for box, at in zip(boxes, best)],
+                decode=decode,
+                batch=batch,
+                size=size,
             )
             for level, size in enumerate(self.sizes)
-        ]  # fmt: skip
+        ]
         # Rows of the joined answers come level by level: put them back into the order of the boxes.
         return [join(found)[np.argsort(np.argsort(at, kind="stable"))] for found, at in zip(zip(*levels), best)]
 
@@ -100,7 +115,7 @@ def side_of(box: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
     return np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
 
 
-def join(parts: Sequence[Observations]) -> Observations:
+def join(parts: Sequence[ObjectPosteriors]) -> ObjectPosteriors:
     """Answers for one image put together, in order. Raises `InputError` when there is nothing to join."""
     if not parts:
         raise input_error("no observations to join", got=0, expected="at least one set")
@@ -111,5 +126,5 @@ def join(parts: Sequence[Observations]) -> Observations:
             return ViewpointModes(*(np.concatenate([getattr(value, name) for value in values]) for name in names))
         return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
 
-    names = [field.name for field in dataclasses.fields(Observations)]
-    return Observations(**{name: together([getattr(part, name) for part in parts]) for name in names})
+    names = [field.name for field in dataclasses.fields(ObjectPosteriors)]
+    return ObjectPosteriors(**{name: together([getattr(part, name) for part in parts]) for name in names})

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import box_iou, suppress
-from nolbo_ppl.inference.posterior.decode import Regions, assemble
+from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
 from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer, decode_latents, extents, sampled_shapes
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
 from nolbo_ppl.inference.posterior.preprocess import Prepared, prepare_all, same_shape
@@ -24,7 +24,7 @@ from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import cell_of, decode_box
-from nolbo_ppl.structures.object_posteriors import Observations
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 CANDIDATE = 0.02
 """Regions of at least this objectness count towards the object they describe."""
@@ -62,9 +62,7 @@ class ObservationModel:
         return decode_latents(self.model.story.decoder, z)
 
     @torch.inference_mode()
-    def shape_posterior(
-        self, packed: UInt8[np.ndarray, "n bytes"]
-    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    def shape_posterior(self, packed: UInt8[np.ndarray, "n bytes"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
         """Mean and scale of q(z | true shape) of packed voxel grids: the shape autoencoder's posterior."""
         loc, scale = self.model.shape_guide.posterior(torch.as_tensor(packed))
         return loc.numpy(), scale.numpy()
@@ -99,7 +97,7 @@ class ObservationModel:
             batch: images that go through the network at once.
 
         Returns:
-            `Observations`, or a list of them for a sequence.
+            `ObjectPosteriors`, or a list of them for a sequence.
 
         Raises:
             InputError: an image or its intrinsics cannot be used.
@@ -127,7 +125,7 @@ class ObservationModel:
         samples: int = 8,
         seed: int = 0,
         batch: int = 16,
-    ) -> list[Observations]:
+    ) -> list[ObjectPosteriors]:
         """Posterior of the region responsible for each given box (px of the given image), in the order of the boxes.
 
         The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation). The
@@ -160,7 +158,7 @@ class ObservationModel:
         samples: int,
         seed: int,
         batch: int,
-    ) -> list[Observations]:
+    ) -> list[ObjectPosteriors]:
         """Run batches of images of one shape; `find` gives what to answer for."""
 
         def shapes(q: RegionParameters, diagonal: Tensor) -> ShapeAnswer:
@@ -170,14 +168,16 @@ class ObservationModel:
             story, side = self.model.story, self.config.voxel_size
             return sampled_shapes(story.decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
 
-        results: dict[int, Observations] = {}
+        results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
             encoding = self.encode(torch.stack([prepared[i].image for i in group]))
             logit = self.calibration.objectness(encoding.objectness_logit)
             row, region, odds, look_at = find(encoding, logit, group)
             camera = torch.stack([prepared[i].camera for i in group])[row]
             scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
-            regions = Regions(self._parameters(encoding, row, region, look_at), region, encoding.columns, odds, camera, scale)
+            regions = SelectedRegions(
+                self._parameters(encoding, row, region, look_at), region, encoding.columns, odds, camera, scale
+            )
             answer = assemble(regions, self.config, self.model.story.prior, self._prior_mean, shapes)
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
             for k, i in enumerate(group):
@@ -193,9 +193,7 @@ class ObservationModel:
         q = self.model.guide.parameters_at(encoding, row, region, box=box)
         return self.calibration.apply(q.at_mode(self._prior_mean))
 
-    def _boxes(
-        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]
-    ) -> Float[Tensor, "n 4"]:
+    def _boxes(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> Float[Tensor, "n 4"]:
         """Boxes of regions, px of the scaled image; no second look is needed for them."""
         q = self.model.guide.parameters_at(encoding, row, region, look=False)
         return decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
@@ -222,9 +220,7 @@ class ObservationModel:
         kept = kept[torch.argsort(row[kept], stable=True)]
         return row[kept], region[kept], torch.logit(probability[kept])
 
-    def _responsible(
-        self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
-    ) -> Int[Tensor, " n"]:
+    def _responsible(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
         p, columns = self.config.predictors, encoding.columns
         cell = cell_of(box, encoding.rows, columns, self.config.stride)
         region = (cell[:, None] * p + torch.arange(p)).flatten()

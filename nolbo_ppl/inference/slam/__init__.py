@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.inference.slam.data_association import Associations
-from nolbo_ppl.inference.slam.em import StepInfo, step
+from nolbo_ppl.inference.slam.em import EmStepInfo, step
 from nolbo_ppl.inference.slam.graph import GraphError, Links
 from nolbo_ppl.inference.slam.ground_truth_association import solve_with_associations
-from nolbo_ppl.inference.slam.incremental.online_slam import ObjectSlam, OnlineInfo, solve_online
+from nolbo_ppl.inference.slam.incremental.online_slam import IncrementalSlam, OnlineInfo, solve_online
 from nolbo_ppl.inference.slam.initialise import SlamState, init
 from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
@@ -23,7 +24,7 @@ __all__ = [
     "Landmark",
     "Links",
     "NoiseModel",
-    "ObjectSlam",
+    "IncrementalSlam",
     "OnlineInfo",
     "PlainInfo",
     "PlainState",
@@ -31,7 +32,7 @@ __all__ = [
     "SlamProblem",
     "SlamResult",
     "SlamState",
-    "StepInfo",
+    "EmStepInfo",
     "Tracklets",
     "estimate_noise",
     "finish",
@@ -45,3 +46,6 @@ __all__ = [
     "solve_with_associations",
     "step",
 ]
+
+
+__getattr__ = renamed(__name__, {"ObjectSlam": "IncrementalSlam", "StepInfo": "EmStepInfo"})

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import Estimate
+from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import Pairs, PosteriorSamples
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
@@ -33,7 +33,7 @@ FEATURE_MINIMUM = -6.0
 
 
 @dataclass(frozen=True)
-class Closing:
+class LoopClosure:
     """A group of pairs accepted together."""
 
     a: Int[np.ndarray, " c"]
@@ -110,9 +110,15 @@ def promising_nodes(together: Bool[np.ndarray, "p p"], minimum: int) -> Int[np.n
 
 
 def find_closing(
-    pairs: Pairs, estimate: Estimate, samples: PosteriorSamples, config: SlamConfig, *, inflation: float, floor: float,
+    pairs: Pairs,
+    estimate: SlamEstimate,
+    samples: PosteriorSamples,
+    config: SlamConfig,
+    *,
+    inflation: float,
+    floor: float,
     log_new: float,
-) -> Closing | None:
+) -> LoopClosure | None:
     """The best clique of one window's pairs, or None when it is too small, too weak or not unique."""
     if len(pairs) < config.constellation_minimum:
         return None
@@ -153,7 +159,7 @@ def find_closing(
         if shared < 0.5 * min(len(other), len(members)) and not same_motion:
             rival = max(rival, value)
             break
-    return Closing(pairs.a[members], pairs.b[members], best, best - rival)
+    return LoopClosure(pairs.a[members], pairs.b[members], best, best - rival)
 
 
 def windows(first: Int[np.ndarray, " m"], size: int) -> list[Int[np.ndarray, " w"]]:
@@ -166,9 +172,16 @@ def windows(first: Int[np.ndarray, " m"], size: int) -> list[Int[np.ndarray, " w
 
 
 def close_constellations(
-    pairs: Pairs, first: Int[np.ndarray, " m"], estimate: Estimate, samples: PosteriorSamples, config: SlamConfig,
-    *, inflation: float, floor: float, log_new: float,
-) -> list[Closing]:
+    pairs: Pairs,
+    first: Int[np.ndarray, " m"],
+    estimate: SlamEstimate,
+    samples: PosteriorSamples,
+    config: SlamConfig,
+    *,
+    inflation: float,
+    floor: float,
+    log_new: float,
+) -> list[LoopClosure]:
     """Closings of every window that pass, best first, no tracklet closed twice in different ways."""
     found = []
     order = np.argsort(pairs.a, kind="stable")
@@ -179,13 +192,8 @@ def close_constellations(
         rows = np.concatenate([order[s:e] for s, e in zip(low, high)]) if len(member) else np.zeros(0, int)
         # Pairs within the window itself are short-term matters, left to the soft E-step.
         rows = rows[~np.isin(pairs.b[rows], member)]
-        closing = find_closing(pairs.select(rows), estimate, samples, config, inflation=inflation, floor=floor,
-                               log_new=log_new)
-        if (
-            closing
-            and closing.log_odds > config.constellation_log_odds
-            and closing.margin > config.constellation_log_odds / 2
-        ):
+        closing = find_closing(pairs.select(rows), estimate, samples, config, inflation=inflation, floor=floor, log_new=log_new)
+        if closing and closing.log_odds > config.constellation_log_odds and closing.margin > config.constellation_log_odds / 2:
             found.append(closing)
     found.sort(key=lambda closing: -closing.log_odds)
     partner: dict[int, int] = {}

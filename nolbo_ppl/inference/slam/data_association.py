@@ -11,7 +11,7 @@ from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.association import association_marginals_batch
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_features
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import Estimate, Linearisation
+from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density, observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
@@ -41,8 +41,14 @@ class Associations:
 
 
 def associate_detections(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior, estimate: Estimate,
-    features: TrackletFeatures, linearisation: Linearisation, rng: np.random.Generator,
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    prior: FeaturePrior,
+    estimate: SlamEstimate,
+    features: TrackletFeatures,
+    linearisation: Linearisation,
+    rng: np.random.Generator,
 ) -> Associations:
     """Marginals of all detections over the landmarks of a map.
 
@@ -59,14 +65,18 @@ def associate_detections(
     rows, landmarks, square, log_det = _gated(problem, noise, estimate, pose_delta, landmark_delta)
     value = np.log(objectness[rows]) - 0.5 * (square + log_det)
     latent, variance, category = detection_features(table, noise, prior)
-    value += prior.pair_log_ratio(latent[rows], variance[rows], category[rows], features.latent[landmarks],
-                                  features.latent_variance[landmarks], features.category[landmarks])
+    value += prior.pair_log_ratio(
+        latent[rows],
+        variance[rows],
+        category[rows],
+        features.latent[landmarks],
+        features.latent_variance[landmarks],
+        features.category[landmarks],
+    )
     both = np.flatnonzero(table.has_rotation[rows] & features.oriented[landmarks])
     if len(both):
         k, j = rows[both], landmarks[both]
-        predicted = (
-            np.swapaxes(estimate.T_world_camera[table.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
-        )
+        predicted = np.swapaxes(estimate.T_world_camera[table.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
         scale = np.sqrt(noise.rotation_scale**2 + 0.02**2)
         modes = observed_modes(table, scale, k)
         value[both] += mixture_log_density(predicted, modes, resolved_symmetry(table, config)[k], config) - UNIFORM_LOG_DENSITY
@@ -74,7 +84,7 @@ def associate_detections(
 
 
 def _gated(
-    problem: SlamProblem, noise: NoiseModel, estimate: Estimate, pose_delta: np.ndarray, landmark_delta: np.ndarray
+    problem: SlamProblem, noise: NoiseModel, estimate: SlamEstimate, pose_delta: np.ndarray, landmark_delta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Detection-landmark pairs inside the gate: rows, landmarks, squared distances and log determinants of 2 pi S."""
     table = problem.observations
@@ -127,9 +137,7 @@ def _marginals(
     sorted_rows = rows[by_row]
     problems, columns_of = [], []
     for group in groups:
-        spans = [
-            by_row[np.searchsorted(sorted_rows, k, "left") : np.searchsorted(sorted_rows, k, "right")] for k in group
-        ]
+        spans = [by_row[np.searchsorted(sorted_rows, k, "left") : np.searchsorted(sorted_rows, k, "right")] for k in group]
         entries = np.concatenate(spans)
         columns, column = np.unique(landmarks[entries], return_inverse=True)
         log_likelihood = np.full((len(group), len(columns)), -np.inf)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
-from nolbo_ppl.io.observations import ObservationTable
+from nolbo_ppl.io.observations import Detections
 
 LARGE_VARIANCE = 1e12
 """Variance that stands for a missing latent: it carries no weight."""
@@ -44,8 +44,13 @@ class FeaturePrior:
         return np.where((a < 0) | (b < 0), 0.0, ratio)
 
     def pair_log_ratio(
-        self, latent_a: np.ndarray, variance_a: np.ndarray, category_a: np.ndarray, latent_b: np.ndarray,
-        variance_b: np.ndarray, category_b: np.ndarray,
+        self,
+        latent_a: np.ndarray,
+        variance_a: np.ndarray,
+        category_a: np.ndarray,
+        latent_b: np.ndarray,
+        variance_b: np.ndarray,
+        category_b: np.ndarray,
     ) -> Float[np.ndarray, " p"]:
         """Log ratio of a's features given b to those of any object, nats.
 
@@ -56,7 +61,8 @@ class FeaturePrior:
             return category
         known = (variance_a[:, 0] < LARGE_VARIANCE) & (variance_b[:, 0] < LARGE_VARIANCE)
         latent = latent_log_density(latent_a, latent_b, variance_a + variance_b) - latent_log_density(
-            latent_a, self.mean, variance_a + self.variance)
+            latent_a, self.mean, variance_a + self.variance
+        )
         return np.where(known, latent + np.minimum(category, 0.0), category)
 
 
@@ -65,7 +71,7 @@ def latent_log_density(x: np.ndarray, mean: np.ndarray, variance: np.ndarray) ->
     return -0.5 * np.sum((x - mean) ** 2 / variance + np.log(2 * np.pi * variance), axis=-1)
 
 
-def fit_prior(table: ObservationTable, config: SlamConfig) -> FeaturePrior:
+def fit_prior(table: Detections, config: SlamConfig) -> FeaturePrior:
     """Moments of all latents and shares of all categories."""
     known = table.has_latent
     d = table.latent_dim
@@ -77,16 +83,14 @@ def fit_prior(table: ObservationTable, config: SlamConfig) -> FeaturePrior:
     return FeaturePrior(mean, variance, tuple(str(c) for c in categories), np.log(shares), config.category_error)
 
 
-def category_index(table: ObservationTable, prior: FeaturePrior) -> Int[np.ndarray, " n"]:
+def category_index(table: Detections, prior: FeaturePrior) -> Int[np.ndarray, " n"]:
     """Index of each detection's category, -1 where it has none or one the prior does not know."""
     lookup = {name: i for i, name in enumerate(prior.categories)}
-    return np.array([lookup.get(c, -1) if c is not None else -1 for c in table.category], dtype=np.int64).reshape(
-        len(table)
-    )
+    return np.array([lookup.get(c, -1) if c is not None else -1 for c in table.category], dtype=np.int64).reshape(len(table))
 
 
 def detection_features(
-    table: ObservationTable, noise: NoiseModel, prior: FeaturePrior
+    table: Detections, noise: NoiseModel, prior: FeaturePrior
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
     """Latent, its variance (very large where missing) and category index of every detection."""
     known = table.has_latent[:, None]
@@ -113,8 +117,11 @@ def correlated_variance(
 
 
 def weighted_latents(
-    latent: Float[np.ndarray, "n d"], variance: Float[np.ndarray, "n d"], group: Int[np.ndarray, " n"],
-    weight: Float[np.ndarray, " n"], groups: int,
+    latent: Float[np.ndarray, "n d"],
+    variance: Float[np.ndarray, "n d"],
+    group: Int[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"],
+    groups: int,
 ) -> tuple[Float[np.ndarray, "g d"], Float[np.ndarray, "g d"]]:
     """Latent update: `mu_j = sum w_kj mu_k / s_k^2 / sum w_kj / s_k^2` and its variance (NOLBO eq. optimal_mu, corrected:
     positive, normalised, precision-weighted). Rows of group -1 are left out; groups without a latent get LARGE_VARIANCE.

@@ -32,7 +32,7 @@ CONTRADICTION = 0.7
 
 
 @dataclass(frozen=True)
-class StepInfo:
+class EmStepInfo:
     """What one iteration did."""
 
     iteration: int
@@ -54,14 +54,17 @@ class StepInfo:
 
 
 def link_arrays(
-    R: Float[np.ndarray, "m 3 3"], features: TrackletFeatures, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"],
-    weight: Float[np.ndarray, " l"], position_scale: float,
+    R: Float[np.ndarray, "m 3 3"],
+    features: TrackletFeatures,
+    a: Int[np.ndarray, " l"],
+    b: Int[np.ndarray, " l"],
+    weight: Float[np.ndarray, " l"],
+    position_scale: float,
 ) -> Links:
     """Links between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
     T = np.tile(np.eye(4), (len(a), 1, 1))
     scale = np.tile([LOOSE_ROTATION, position_scale], (len(a), 1))
-    both = np.flatnonzero(features.oriented[a] & features.oriented[b] & (features.symmetry[a] != 0)
-                          & (features.symmetry[b] != 0))
+    both = np.flatnonzero(features.oriented[a] & features.oriented[b] & (features.symmetry[a] != 0) & (features.symmetry[b] != 0))
     if len(both):
         i, j = a[both], b[both]
         turned = nearest_mode_rotation(R[i], R[j], features.symmetry[j])
@@ -78,9 +81,7 @@ def make_links(state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " 
     return link_arrays(state.estimate.T_world_landmark[:, :3, :3], state.features, a, b, weight, state.link_scale)
 
 
-def groups_seen_together(
-    first: Int[np.ndarray, " m"], last: Int[np.ndarray, " m"], limit: int = 16
-) -> list[np.ndarray]:
+def groups_seen_together(first: Int[np.ndarray, " m"], last: Int[np.ndarray, " m"], limit: int = 16) -> list[np.ndarray]:
     """Tracklets in the order of their first frames, cut into groups that overlap in time one with all."""
     order = np.argsort(first, kind="stable")
     out, start = [], 0
@@ -107,7 +108,7 @@ def soft_assignment(
     sorted_a = pairs.a[order]
     a_out, b_out, w_out, evidence = [], [], [], 0.0
     for group in groups_seen_together(features.first, features.last):
-        spans = [order[np.searchsorted(sorted_a, i, "left"):np.searchsorted(sorted_a, i, "right")] for i in group]
+        spans = [order[np.searchsorted(sorted_a, i, "left") : np.searchsorted(sorted_a, i, "right")] for i in group]
         rows = np.concatenate(spans)
         if not len(rows):
             continue
@@ -140,7 +141,7 @@ def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
     return make_links(state, a, b, weight), evidence
 
 
-def step(state: SlamState) -> tuple[SlamState, StepInfo]:
+def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
     """One iteration: samples of the graph, E-step, M-step.
 
     While constellations are found their pairs are linked with weight one; then the soft E-step decides every link anew.
@@ -158,8 +159,9 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
         state = refine_odometry(state, linearisation)
     samples = posterior_samples(linearisation, state.estimate, config.samples, rng)
     inflation = config.annealing[min(state.iteration, len(config.annealing) - 1)]
-    pairs = candidate_pairs(state.estimate, samples, state.features, state.prior, config, inflation=inflation,
-                            floor=state.link_scale)
+    pairs = candidate_pairs(
+        state.estimate, samples, state.features, state.prior, config, inflation=inflation, floor=state.link_scale
+    )
     closings = 0
     evidence = 0.0
     phase = "em"
@@ -197,7 +199,7 @@ def step(state: SlamState) -> tuple[SlamState, StepInfo]:
     moved = estimate.T_world_camera[:, :3, 3] - state.estimate.T_world_camera[:, :3, 3]
     state = replace(state, estimate=estimate, links=links, iteration=state.iteration + 1, graph_error=error)
     state = replace(state, weight=inlier_weights(state))
-    info = StepInfo(
+    info = EmStepInfo(
         iteration=state.iteration,
         phase=phase,
         log_evidence=float(evidence - error),

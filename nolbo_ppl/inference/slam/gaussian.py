@@ -22,9 +22,7 @@ def squared_distance(
     return np.maximum(square, 0.0), np.log(determinant) + 3.0 * LOG_2PI
 
 
-def log_normal(
-    error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]
-) -> Float[np.ndarray, " ..."]:
+def log_normal(error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."]:
     """Log density of N(error; 0, S), per m^3."""
     square, log_det = squared_distance(error, covariance)
     return -0.5 * (square + log_det)

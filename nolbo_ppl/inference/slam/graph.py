@@ -33,7 +33,7 @@ class GraphError(NolboError, RuntimeError):
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SlamEstimate:
     """Values of all variables."""
 
     T_world_camera: Float[np.ndarray, "n 4 4"]
@@ -102,8 +102,13 @@ def widened(
 
 
 def resolve_observations(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, estimate: Estimate, rows: Int[np.ndarray, " k"],
-    landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"],
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    estimate: SlamEstimate,
+    rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"],
+    weight: Float[np.ndarray, " k"],
 ) -> ObservationFactors:
     """Measured relative poses of the given detections; a factor of several orientation modes is split by their responsibilities.
 
@@ -134,8 +139,9 @@ def resolve_observations(
 def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.NonlinearFactorGraph:
     """Gauge prior on the first pose and one factor a step."""
     graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(problem.odometry[0]),
-                                     gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE)))
+    graph.add(
+        gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(problem.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE))
+    )
     steps = relative(problem.odometry[:-1], problem.odometry[1:])
     for i, step in enumerate(steps):
         sigmas = np.repeat([noise.rotation_step[i], noise.translation_step[i]], 3)
@@ -163,8 +169,11 @@ def add_observation_factors(
         model: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.SqrtInformation(information[k], False)
         if kernel is not None:
             model = gtsam.noiseModel.Robust.Create(kernel, model)
-        graph.add(gtsam.BetweenFactorPose3(pose_key(factors.frame[k]), landmark_key(factors.landmark[k]),
-                                           gtsam.Pose3(factors.T_camera_landmark[k]), model))
+        graph.add(
+            gtsam.BetweenFactorPose3(
+                pose_key(factors.frame[k]), landmark_key(factors.landmark[k]), gtsam.Pose3(factors.T_camera_landmark[k]), model
+            )
+        )
 
 
 def add_landmark_priors(
@@ -187,11 +196,12 @@ def add_links(graph: gtsam.NonlinearFactorGraph, links: Links, robust_width: flo
         model: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         if robust_width is not None:
             model = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(robust_width), model)
-        graph.add(gtsam.BetweenFactorPose3(landmark_key(links.a[k]), landmark_key(links.b[k]),
-                                           gtsam.Pose3(links.T_a_b[k]), model))
+        graph.add(
+            gtsam.BetweenFactorPose3(landmark_key(links.a[k]), landmark_key(links.b[k]), gtsam.Pose3(links.T_a_b[k]), model)
+        )
 
 
-def to_values(estimate: Estimate) -> gtsam.Values:
+def to_values(estimate: SlamEstimate) -> gtsam.Values:
     """GTSAM values of an estimate."""
     values = gtsam.Values()
     for i, T in enumerate(estimate.T_world_camera):
@@ -201,24 +211,22 @@ def to_values(estimate: Estimate) -> gtsam.Values:
     return values
 
 
-def from_values(values: gtsam.Values, poses: int, landmarks: int) -> Estimate:
+def from_values(values: gtsam.Values, poses: int, landmarks: int) -> SlamEstimate:
     """An estimate of GTSAM values."""
     camera = np.array([values.atPose3(pose_key(i)).matrix() for i in range(poses)]).reshape(poses, 4, 4)
     landmark = np.array([values.atPose3(landmark_key(j)).matrix() for j in range(landmarks)]).reshape(landmarks, 4, 4)
-    return Estimate(camera, landmark)
+    return SlamEstimate(camera, landmark)
 
 
 def named_error(error: RuntimeError) -> GraphError:
     """Turn GTSAM's complaint into one that names the variable."""
     text = " ".join(str(error).split())
-    return GraphError(
-        f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)"
-    )
+    return GraphError(f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)")
 
 
 def optimise(
-    graph: gtsam.NonlinearFactorGraph, estimate: Estimate, *, iterations: int = 20, relative_tolerance: float = 1e-5
-) -> tuple[Estimate, float, float]:
+    graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate, *, iterations: int = 20, relative_tolerance: float = 1e-5
+) -> tuple[SlamEstimate, float, float]:
     """Levenberg-Marquardt from an estimate; the new one and the error (half squared, whitened) before and after.
 
     Raises:
@@ -256,9 +264,7 @@ class Linearisation:
     factor: scipy.sparse.linalg.SuperLU
     """Factorisation of its normal matrix."""
 
-    def samples(
-        self, count: int, rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
+    def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
         """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""
         noise = rng.standard_normal((self.jacobian.shape[0], count))
         delta = self.factor.solve(self.jacobian.T @ noise).reshape(-1, 6, count)
@@ -283,7 +289,7 @@ class Linearisation:
         return float(np.sum(np.log(np.abs(self.factor.U.diagonal()))))
 
 
-def linearise(graph: gtsam.NonlinearFactorGraph, estimate: Estimate) -> Linearisation:
+def linearise(graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate) -> Linearisation:
     """Linearise at an estimate and factorise the normal matrix (SuperLU without pivoting: it is positive definite).
 
     Raises:
@@ -297,8 +303,9 @@ def linearise(graph: gtsam.NonlinearFactorGraph, estimate: Estimate) -> Linearis
     jacobian = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))[:, :size]
     normal = (jacobian.T @ jacobian).tocsc()
     try:
-        factor = scipy.sparse.linalg.splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                                          options={"SymmetricMode": True})
+        factor = scipy.sparse.linalg.splu(
+            normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
     except RuntimeError as error:
         raise GraphError(f"the linearised graph is indeterminate: {error}") from None
     return Linearisation(len(estimate.T_world_landmark), len(estimate.T_world_camera), jacobian, factor)

@@ -39,8 +39,14 @@ def solve_with_associations(
     features = tracklet_features(problem, noise, config, prior, rows, landmark, weight, count)
     full = np.full(len(object_of), -1)
     full[rows] = landmark
-    tracklets = Tracklets(full, (full >= 0).astype(float), features.first, features.last,
-                          np.bincount(landmark, minlength=count), np.zeros(count, bool))
+    tracklets = Tracklets(
+        full,
+        (full >= 0).astype(float),
+        features.first,
+        features.last,
+        np.bincount(landmark, minlength=count),
+        np.zeros(count, bool),
+    )
     state = SlamState(
         problem=problem,
         config=config,

@@ -18,9 +18,9 @@ from nolbo_ppl.inference.slam.detection_features import (
 )
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import (
-    Estimate,
     Linearisation,
     Links,
+    SlamEstimate,
     add_landmark_priors,
     add_links,
     add_observation_factors,
@@ -49,7 +49,7 @@ def first_estimate(
     rows: Int[np.ndarray, " k"],
     landmark: Int[np.ndarray, " k"],
     landmarks: int,
-) -> Estimate:
+) -> SlamEstimate:
     """Landmarks at the weighted mean of their detections in the odometry frame, oriented as most of them agree."""
     table = problem.observations
     frame = table.frame[rows]
@@ -71,13 +71,14 @@ def first_estimate(
         a, b = np.repeat(np.arange(len(candidates)), len(members)), np.tile(members, len(candidates))
         value = mixture_log_density(candidates[a], modes.select(b), symmetry[oriented[b]], config)
         T[j, :3, :3] = candidates[np.argmax(value.reshape(len(candidates), -1).sum(axis=1))]
-    return Estimate(problem.odometry.copy(), T)
+    return SlamEstimate(problem.odometry.copy(), T)
 
 
 def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     """Odometry, weighted observations and weak priors; the M-step adds its links."""
-    factors = resolve_observations(state.problem, state.noise, state.config, state.estimate, state.rows, state.landmark,
-                                   state.weight)
+    factors = resolve_observations(
+        state.problem, state.noise, state.config, state.estimate, state.rows, state.landmark, state.weight
+    )
     graph = odometry_factors(state.problem, state.noise)
     add_observation_factors(graph, factors)
     add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
@@ -92,9 +93,7 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     """
     table, rows = state.problem.observations, state.rows
     frame = table.frame[rows]
-    predicted = transform(
-        inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
-    )
+    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
     error = predicted - table.position[rows]
     S = state.noise.position_covariance[rows]
     objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
@@ -104,8 +103,14 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
 
 
 def tracklet_features(
-    problem: SlamProblem, noise: NoiseModel, config: SlamConfig, prior: FeaturePrior, rows: Int[np.ndarray, " k"],
-    landmark: Int[np.ndarray, " k"], weight: Float[np.ndarray, " k"], landmarks: int,
+    problem: SlamProblem,
+    noise: NoiseModel,
+    config: SlamConfig,
+    prior: FeaturePrior,
+    rows: Int[np.ndarray, " k"],
+    landmark: Int[np.ndarray, " k"],
+    weight: Float[np.ndarray, " k"],
+    landmarks: int,
 ) -> TrackletFeatures:
     """Latent posterior, category, symmetry and life span of each landmark from its detections."""
     table = problem.observations
@@ -129,7 +134,6 @@ def tracklet_features(
 
 def linearise_state(state: SlamState) -> Linearisation:
     """Linearise the graph with its links at the estimate, each link by its robust weight there."""
-
 
     graph = base_graph(state)
     add_links(graph, state.links, state.config.robust_width)
@@ -172,10 +176,18 @@ def init_from_tracklets(
     landmark, weight = landmark[rows], tracklets.weight[rows]
     distance = np.linalg.norm(problem.observations.position, axis=1)
     state = SlamState(
-        problem=problem, config=config, noise=noise, prior=prior, tracklets=tracklets, static=static, rows=rows,
-        landmark=landmark, weight=weight,
+        problem=problem,
+        config=config,
+        noise=noise,
+        prior=prior,
+        tracklets=tracklets,
+        static=static,
+        rows=rows,
+        landmark=landmark,
+        weight=weight,
         features=tracklet_features(problem, noise, config, prior, rows, landmark, weight, len(static)),
-        estimate=first_estimate(problem, noise, config, rows, landmark, len(static)), links=Links.none(),
+        estimate=first_estimate(problem, noise, config, rows, landmark, len(static)),
+        links=Links.none(),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
     )
     for repeat in range(3):

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import Estimate, Linearisation
+from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.orientation import orientation_log_density
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
@@ -94,7 +94,7 @@ def log_population(
 
 
 def posterior_samples(
-    linearisation: Linearisation, estimate: Estimate, count: int, rng: np.random.Generator
+    linearisation: Linearisation, estimate: SlamEstimate, count: int, rng: np.random.Generator
 ) -> PosteriorSamples:
     """Samples of all tracklets in the world frame."""
     _, delta = linearisation.samples(count, rng)
@@ -102,9 +102,7 @@ def posterior_samples(
     return PosteriorSamples(np.einsum("mij,mjs->mis", R, delta[:, 3:]), np.einsum("mij,mjs->mis", R, delta[:, :3]))
 
 
-def gap_covariance(
-    samples: PosteriorSamples, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
-) -> Float[np.ndarray, "p 3 3"]:
+def gap_covariance(samples: PosteriorSamples, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]) -> Float[np.ndarray, "p 3 3"]:
     """Covariance of the position of a less that of b, m^2."""
     out = np.empty((len(a), 3, 3))
     count = samples.position.shape[2]
@@ -116,8 +114,14 @@ def gap_covariance(
 
 
 def candidate_pairs(
-    estimate: Estimate, samples: PosteriorSamples, features: TrackletFeatures, prior: FeaturePrior, config: SlamConfig,
-    *, inflation: float, floor: float,
+    estimate: SlamEstimate,
+    samples: PosteriorSamples,
+    features: TrackletFeatures,
+    prior: FeaturePrior,
+    config: SlamConfig,
+    *,
+    inflation: float,
+    floor: float,
 ) -> Pairs:
     """All pairs (newer, older) that are never seen together and whose gap is inside the gate, with their evidence.
 
@@ -156,8 +160,13 @@ def candidate_pairs(
 
 
 def feature_log_ratio(
-    estimate: Estimate, samples: PosteriorSamples, features: TrackletFeatures, prior: FeaturePrior, config: SlamConfig,
-    a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"],
+    estimate: SlamEstimate,
+    samples: PosteriorSamples,
+    features: TrackletFeatures,
+    prior: FeaturePrior,
+    config: SlamConfig,
+    a: Int[np.ndarray, " p"],
+    b: Int[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
     """Log ratio of a's latent, category and orientation given that it is b to those of any object, nats."""
     ratio = prior.category_log_ratio(features.category[b], features.category[a])
@@ -173,7 +182,7 @@ def feature_log_ratio(
 
 
 def _orientation_log_ratio(
-    estimate: Estimate,
+    estimate: SlamEstimate,
     samples: PosteriorSamples,
     features: TrackletFeatures,
     config: SlamConfig,
@@ -194,8 +203,9 @@ def _orientation_log_ratio(
     typical = np.zeros(len(rows))
     np.maximum.at(typical, inverse, scale)
     grid_a, grid_c = np.repeat(rows, len(others)), np.tile(others, len(rows))
-    population = orientation_log_density(R[grid_c], R[grid_a], np.repeat(typical, len(others)),
-                                         features.symmetry[grid_a], config).reshape(len(rows), len(others))
+    population = orientation_log_density(
+        R[grid_c], R[grid_a], np.repeat(typical, len(others)), features.symmetry[grid_a], config
+    ).reshape(len(rows), len(others))
     population = np.where(others[None] == rows[:, None], -np.inf, population)
     log_population = np.logaddexp.reduce(population, axis=1) - np.log(max(len(others), 1))
     from_uniform = orientation_log_density(R[a], R[a], np.full(len(a), 1e3), features.symmetry[a], config)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
-from nolbo_ppl.inference.slam.graph import Estimate
+from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, write_voxels
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
@@ -96,7 +96,7 @@ def trajectory_errors(estimate: np.ndarray, truth: np.ndarray) -> dict[str, floa
     return out
 
 
-def write_iterations(path: str | PathLike[str], history: Sequence[Estimate]) -> None:
+def write_iterations(path: str | PathLike[str], history: Sequence[SlamEstimate]) -> None:
     """Every iteration in one NPZ file, atomically: `T_world_camera` [i, n, 4, 4] float32, and `landmarks_0` [m, 3], ...,
     the positions of the landmarks each iteration held, in m; 0 is the odometry, the last one the result.
     """

@@ -11,7 +11,7 @@ from jaxtyping import Int
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.data_association import Associations, associate_detections
 from nolbo_ppl.inference.slam.em import make_links
-from nolbo_ppl.inference.slam.graph import Estimate, Links, linearise, optimise
+from nolbo_ppl.inference.slam.graph import Links, SlamEstimate, linearise, optimise
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
     base_graph,
@@ -45,11 +45,16 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
     landmark = cluster[state.landmark]
     moved = replace(state.problem, odometry=state.estimate.T_world_camera)
     estimate = first_estimate(moved, state.noise, state.config, state.rows, landmark, count)
-    features = tracklet_features(
-        state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count
+    features = tracklet_features(state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count)
+    return replace(
+        state,
+        landmark=landmark,
+        static=np.arange(count),
+        features=features,
+        links=Links.none(),
+        closed={},
+        estimate=SlamEstimate(state.estimate.T_world_camera, estimate.T_world_landmark),
     )
-    return replace(state, landmark=landmark, static=np.arange(count), features=features, links=Links.none(), closed={},
-                   estimate=Estimate(state.estimate.T_world_camera, estimate.T_world_landmark))
 
 
 def solve_clean(state: SlamState, repeats: int = 3, tolerance: float = 1e-8) -> SlamState:
@@ -70,9 +75,7 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
     samples = posterior_samples(linearise_state(state), state.estimate, state.config.samples, rng)
     frames = frames_of_landmarks(state)
     spans = replace(state.features, first=np.arange(len(frames)), last=np.arange(len(frames)))  # every pair once
-    pairs = candidate_pairs(
-        state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale
-    )
+    pairs = candidate_pairs(state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale)
     value = pairs.log_position + pairs.log_feature - np.log(state.noise.new_rate)
     apart = np.array([frames[i].isdisjoint(frames[j]) for i, j in zip(pairs.a, pairs.b)], dtype=bool)
     good = np.flatnonzero((value > MERGE_LOG_ODDS) & apart)
@@ -86,8 +89,16 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
 def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, Associations]:
     """E-step of every detection against the map; detections join or leave landmarks by it, empty landmarks go."""
     graph = base_graph(state)
-    found = associate_detections(state.problem, state.noise, state.config, state.prior, state.estimate, state.features,
-                                 linearise(graph, state.estimate), rng)
+    found = associate_detections(
+        state.problem,
+        state.noise,
+        state.config,
+        state.prior,
+        state.estimate,
+        state.features,
+        linearise(graph, state.estimate),
+        rng,
+    )
     best = np.full(len(state.problem.observations), -1)
     weight = np.zeros(len(best))
     order = np.argsort(found.weight, kind="stable")
@@ -108,11 +119,15 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
     rows = number[state.landmark] >= 0
     landmark = number[state.landmark[rows]]
     count = int(keep.sum())
-    state = replace(state, rows=state.rows[rows], landmark=landmark, weight=state.weight[rows], static=np.arange(count),
-                    estimate=Estimate(state.estimate.T_world_camera, state.estimate.T_world_landmark[keep]))
-    features = tracklet_features(
-        state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count
+    state = replace(
+        state,
+        rows=state.rows[rows],
+        landmark=landmark,
+        weight=state.weight[rows],
+        static=np.arange(count),
+        estimate=SlamEstimate(state.estimate.T_world_camera, state.estimate.T_world_landmark[keep]),
     )
+    features = tracklet_features(state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count)
     return replace(state, features=features)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import so3_exp, so3_log
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
-from nolbo_ppl.io.observations import ObservationTable
+from nolbo_ppl.io.observations import Detections
 
 UNIFORM_LOG_DENSITY = -np.log(8.0 * np.pi**2)
 """Log density of the uniform distribution on SO(3) with respect to rotation vectors at the identity, rad^-3."""
@@ -26,7 +26,7 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class RotationModes:
+class OrientationModes:
     """Modes of observed orientations, padded to the same number."""
 
     log_weight: Float[np.ndarray, "n K"]
@@ -39,33 +39,35 @@ class RotationModes:
     def __len__(self) -> int:
         return len(self.log_weight)
 
-    def select(self, rows: np.ndarray) -> RotationModes:
+    def select(self, rows: np.ndarray) -> OrientationModes:
         """Some of the rows."""
-        return RotationModes(self.log_weight[rows], self.R[rows], self.scale[rows])
+        return OrientationModes(self.log_weight[rows], self.R[rows], self.scale[rows])
 
-    def turned(self, R: Float[np.ndarray, "... 3 3"]) -> RotationModes:
+    def turned(self, R: Float[np.ndarray, "... 3 3"]) -> OrientationModes:
         """The same in another frame: every mode multiplied by R (one, or one a row) from the left."""
-        return RotationModes(self.log_weight, (R[:, None] if R.ndim == 3 else R) @ self.R, self.scale)
+        return OrientationModes(self.log_weight, (R[:, None] if R.ndim == 3 else R) @ self.R, self.scale)
 
-    def padded(self, count: int) -> RotationModes:
+    def padded(self, count: int) -> OrientationModes:
         """With room for `count` modes."""
         n, more = len(self), count - self.log_weight.shape[1]
         if more <= 0:
             return self
-        return RotationModes(np.concatenate([self.log_weight, np.full((n, more), -np.inf)], axis=1),
-                             np.concatenate([self.R, np.tile(np.eye(3), (n, more, 1, 1))], axis=1),
-                             np.concatenate([self.scale, np.ones((n, more))], axis=1))
+        return OrientationModes(
+            np.concatenate([self.log_weight, np.full((n, more), -np.inf)], axis=1),
+            np.concatenate([self.R, np.tile(np.eye(3), (n, more, 1, 1))], axis=1),
+            np.concatenate([self.scale, np.ones((n, more))], axis=1),
+        )
 
 
-def resolved_symmetry(table: ObservationTable, config: SlamConfig) -> Int[np.ndarray, " n"]:
+def resolved_symmetry(table: Detections, config: SlamConfig) -> Int[np.ndarray, " n"]:
     """Symmetry order of every observation: its own, else its category's, else none (1)."""
     by_category = np.array([config.category_symmetry.get(c, 1) if c else 1 for c in table.category], dtype=np.int64)
     return np.where(table.symmetry >= 0, table.symmetry, by_category.reshape(len(table)))
 
 
 def observed_modes(
-    table: ObservationTable, rotation_scale: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"] | None = None
-) -> RotationModes:
+    table: Detections, rotation_scale: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"] | None = None
+) -> OrientationModes:
     """Modes of the given detections: as stated, else one at the observed rotation (the identity where there is none).
 
     Stated scales of modes are corrected as those of the best mode were (`rotation_scale` over the table's).
@@ -86,7 +88,7 @@ def observed_modes(
         stated = table.rotation_scale[rows[k]]
         correction = np.where(np.isfinite(stated), rotation_scale[rows[k]] / np.where(np.isfinite(stated), stated, 1.0), 1.0)
         R[k], scale[k] = table.mode_rotation[rows[k]], table.mode_std[rows[k]] * correction[:, None]
-    return RotationModes(log_weight, R, scale)
+    return OrientationModes(log_weight, R, scale)
 
 
 @cache
@@ -130,7 +132,7 @@ def nearest_mode_rotation(
 
 
 def nearest_of_modes(
-    R_predicted: Float[np.ndarray, "n 3 3"], modes: RotationModes, symmetry: Int[np.ndarray, " n"]
+    R_predicted: Float[np.ndarray, "n 3 3"], modes: OrientationModes, symmetry: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3 3"]:
     """The equivalent, over all modes of each observed orientation, that is closest to the predicted one."""
     n, count = modes.log_weight.shape
@@ -162,8 +164,11 @@ def _turned(
 
 
 def orientation_log_density(
-    R_predicted: Float[np.ndarray, "n 3 3"], R_observed: Float[np.ndarray, "n 3 3"], scale: Float[np.ndarray, " n"],
-    symmetry: Int[np.ndarray, " n"], config: SlamConfig,
+    R_predicted: Float[np.ndarray, "n 3 3"],
+    R_observed: Float[np.ndarray, "n 3 3"],
+    scale: Float[np.ndarray, " n"],
+    symmetry: Int[np.ndarray, " n"],
+    config: SlamConfig,
 ) -> Float[np.ndarray, " n"]:
     """Log density of observed rotations of one mode: a mixture over symmetry, half turns and a uniform part, rad^-3."""
     out = np.full(len(R_predicted), -np.inf)
@@ -176,12 +181,13 @@ def orientation_log_density(
 
 
 def mixture_log_density(
-    R_predicted: Float[np.ndarray, "n 3 3"], modes: RotationModes, symmetry: Int[np.ndarray, " n"], config: SlamConfig
+    R_predicted: Float[np.ndarray, "n 3 3"], modes: OrientationModes, symmetry: Int[np.ndarray, " n"], config: SlamConfig
 ) -> Float[np.ndarray, " n"]:
     """Log density of observed orientations with all their modes, rad^-3."""
     n, count = modes.log_weight.shape
-    by_mode = orientation_log_density(np.repeat(R_predicted, count, axis=0), modes.R.reshape(-1, 3, 3), modes.scale.ravel(),
-                                      np.repeat(symmetry, count), config).reshape(n, count)
+    by_mode = orientation_log_density(
+        np.repeat(R_predicted, count, axis=0), modes.R.reshape(-1, 3, 3), modes.scale.ravel(), np.repeat(symmetry, count), config
+    ).reshape(n, count)
     return np.logaddexp.reduce(modes.log_weight + by_mode, axis=1)
 
 
@@ -200,16 +206,24 @@ class ResolvedModes:
 
 
 def resolve_modes(
-    R_predicted: Float[np.ndarray, "n 3 3"], modes: RotationModes, symmetry: Int[np.ndarray, " n"], config: SlamConfig,
-    *, minimum: float = 1e-3,
+    R_predicted: Float[np.ndarray, "n 3 3"],
+    modes: OrientationModes,
+    symmetry: Int[np.ndarray, " n"],
+    config: SlamConfig,
+    *,
+    minimum: float = 1e-3,
 ) -> ResolvedModes:
     """Responsibilities of all modes, turns and the uninformative part; one with `SURE_MODE` stands alone.
 
     Parts below `minimum` are left out and their share goes to the rest.
     """
     n, count = modes.log_weight.shape
-    row, rotation, scale, log_joint = [np.arange(n)], [R_predicted], [np.full(n, np.inf)], [
-        np.full(n, np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY)]
+    row, rotation, scale, log_joint = (
+        [np.arange(n)],
+        [R_predicted],
+        [np.full(n, np.inf)],
+        [np.full(n, np.log(config.orientation_outlier) + UNIFORM_LOG_DENSITY)],
+    )
     for order in np.unique(symmetry):
         rows = np.flatnonzero(symmetry == order)
         repeated = np.repeat(rows, count)

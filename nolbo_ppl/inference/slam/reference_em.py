@@ -21,8 +21,8 @@ from nolbo_ppl.inference.association import association_marginals_batch
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, detection_features, fit_prior, latent_log_density
 from nolbo_ppl.inference.slam.graph import (
     LOOSE_ROTATION,
-    Estimate,
     ObservationFactors,
+    SlamEstimate,
     add_landmark_priors,
     add_observation_factors,
     odometry_factors,
@@ -63,7 +63,7 @@ class PlainState:
     """Scales in use."""
     modes: Modes
     """Detections by mode."""
-    estimate: Estimate
+    estimate: SlamEstimate
     """Poses and landmarks."""
     prior_pose: Float[np.ndarray, "m 4 4"]
     """Centres of the weak priors on landmarks."""
@@ -129,8 +129,11 @@ def split_modes(problem: SlamProblem, noise: NoiseModel, config: SlamConfig) -> 
 
 
 def plain_init(
-    problem: SlamProblem, config: SlamConfig, T_world_landmark: Float[np.ndarray, "m 4 4"],
-    latent: Float[np.ndarray, "m d"] | None = None, noise: NoiseModel | None = None,
+    problem: SlamProblem,
+    config: SlamConfig,
+    T_world_landmark: Float[np.ndarray, "m 4 4"],
+    latent: Float[np.ndarray, "m d"] | None = None,
+    noise: NoiseModel | None = None,
 ) -> PlainState:
     """Start from odometry and a given set of landmarks.
 
@@ -143,8 +146,11 @@ def plain_init(
     mean = fit_prior(table, config).mean
     distance = np.linalg.norm(table.position, axis=1)
     return PlainState(
-        problem=problem, config=config, noise=noise, modes=split_modes(problem, noise, config),
-        estimate=Estimate(problem.odometry.copy(), np.asarray(T_world_landmark, dtype=np.float64)),
+        problem=problem,
+        config=config,
+        noise=noise,
+        modes=split_modes(problem, noise, config),
+        estimate=SlamEstimate(problem.odometry.copy(), np.asarray(T_world_landmark, dtype=np.float64)),
         prior_pose=np.asarray(T_world_landmark, dtype=np.float64),
         latent=np.tile(mean, (m, 1)) if latent is None else np.asarray(latent, dtype=np.float64),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
@@ -177,9 +183,7 @@ def e_step(state: PlainState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarra
     latent, variance, _ = detection_features(table, noise, fit_prior(table, config))
     if table.latent_dim:
         known = variance[:, 0] < LARGE_VARIANCE
-        log_likelihood[known] += latent_log_density(
-            latent[known][:, None], state.latent[None], variance[known][:, None]
-        )
+        log_likelihood[known] += latent_log_density(latent[known][:, None], state.latent[None], variance[known][:, None])
     objectness = np.clip(table.objectness, *config.objectness_limits)
     log_new = np.log(objectness) + np.log(noise.new_rate)
     if table.latent_dim:
@@ -195,8 +199,11 @@ def e_step(state: PlainState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarra
     order = np.argsort(table.frame, kind="stable")
     frames, starts = np.unique(table.frame[order], return_index=True)
     groups = np.split(order, starts[1:]) if len(frames) else []
-    results = association_marginals_batch([(log_likelihood[g], log_null[g]) for g in groups],
-                                          associator=config.associator) if groups else []
+    results = (
+        association_marginals_batch([(log_likelihood[g], log_null[g]) for g in groups], associator=config.associator)
+        if groups
+        else []
+    )
     weights = np.zeros((n, m))
     for group, result in zip(groups, results):
         weights[group] = result.weights
@@ -210,8 +217,12 @@ def frozen_graph(state: PlainState, mode_weights: Float[np.ndarray, "g m"] | Non
     if mode_weights is not None:
         g, j = np.nonzero(mode_weights > SMALLEST_WEIGHT)
         factors = ObservationFactors(
-            state.problem.observations.frame[state.modes.row[g]], j, state.modes.T_camera_landmark[g],
-            state.modes.covariance[g], mode_weights[g, j])
+            state.problem.observations.frame[state.modes.row[g]],
+            j,
+            state.modes.T_camera_landmark[g],
+            state.modes.covariance[g],
+            mode_weights[g, j],
+        )
         add_observation_factors(graph, factors, minimum=SMALLEST_WEIGHT)
     return graph
 
@@ -221,9 +232,7 @@ def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
     mode_weights, weights, evidence = e_step(state)
     prior_error = frozen_graph(state, None).error(to_values(state.estimate))
     info = PlainInfo(state.iteration + 1, evidence - prior_error, evidence, weights.sum(axis=0))
-    estimate, _, _ = optimise(
-        frozen_graph(state, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10
-    )
+    estimate, _, _ = optimise(frozen_graph(state, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10)
     latent = state.latent
     table = state.problem.observations
     if table.latent_dim:
@@ -235,9 +244,7 @@ def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
     return replace(state, estimate=estimate, latent=latent, iteration=state.iteration + 1), info
 
 
-def plain_solve(
-    state: PlainState, iterations: int = 20, tolerance: float = 1e-4
-) -> tuple[PlainState, tuple[PlainInfo, ...]]:
+def plain_solve(state: PlainState, iterations: int = 20, tolerance: float = 1e-4) -> tuple[PlainState, tuple[PlainInfo, ...]]:
     """Iterate until the bound rises by less than `tolerance` nats."""
     infos: list[PlainInfo] = []
     for _ in range(iterations):

@@ -12,7 +12,7 @@ from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation
 from nolbo_ppl.inference.association.marginals import Associator
-from nolbo_ppl.io.observations import ObservationTable, check_table
+from nolbo_ppl.io.observations import Detections, check_table
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,12 @@ def check_step_covariance(covariance: np.ndarray, steps: int) -> None:
         InputError: a wrong shape, or a row that is not finite, not symmetric, or not positive definite.
     """
     if covariance.shape != (steps, 6, 6):
-        raise input_error("odometry covariance has the wrong shape", got=covariance.shape, expected=(steps, 6, 6),
-                          do="give one 6 x 6 matrix a step, [rotation rad, translation m]")
+        raise input_error(
+            "odometry covariance has the wrong shape",
+            got=covariance.shape,
+            expected=(steps, 6, 6),
+            do="give one 6 x 6 matrix a step, [rotation rad, translation m]",
+        )
     finite = np.isfinite(covariance).all(axis=(1, 2))
     usable = np.where(finite[:, None, None], covariance, np.eye(6))
     largest = np.abs(usable).max(axis=(1, 2), initial=0)
@@ -117,7 +121,7 @@ class SlamProblem:
 
     odometry: Float[np.ndarray, "n 4 4"]
     """Drifting T_world_camera, one row a frame."""
-    observations: ObservationTable
+    observations: Detections
     """Detections in these frames, rows in any order."""
     odometry_covariance: Float[np.ndarray, "n-1 6 6"] | None = None
     """Covariance of every odometry step, [rotation rad, translation m] in the tangent space of T_earlier_later at the later
@@ -129,8 +133,12 @@ class SlamProblem:
             raise input_error("odometry is no trajectory", got=f"shape {T.shape}", expected="[n, 4, 4], n at least 1")
         bad = ~np.isfinite(T).all(axis=(1, 2)) | ~is_rotation(np.nan_to_num(T[:, :3, :3]))
         if bad.any():
-            raise input_error("odometry holds a row that is no pose", got=T[int(np.argmax(bad))],
-                              expected="finite, orthonormal", do=f"look at row {int(np.argmax(bad))}")
+            raise input_error(
+                "odometry holds a row that is no pose",
+                got=T[int(np.argmax(bad))],
+                expected="finite, orthonormal",
+                do=f"look at row {int(np.argmax(bad))}",
+            )
         if self.odometry_covariance is not None:
             check_step_covariance(self.odometry_covariance, len(T) - 1)
         check_table(self.observations, len(T))

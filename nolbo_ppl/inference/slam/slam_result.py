@@ -12,9 +12,9 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, category_index
-from nolbo_ppl.inference.slam.em import StepInfo
+from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.gaussian import log_normal
-from nolbo_ppl.inference.slam.graph import Estimate, Linearisation, linearise
+from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, Voxels, decode_landmarks
 from nolbo_ppl.inference.slam.map_refinement import final_graph
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -29,11 +29,11 @@ class SlamResult:
     """The final state."""
     associations: Associations
     """Marginal association of every detection."""
-    infos: tuple[StepInfo, ...]
+    infos: tuple[EmStepInfo, ...]
     """One record an iteration."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time by phase."""
-    history: tuple[Estimate, ...] = ()
+    history: tuple[SlamEstimate, ...] = ()
     """Poses and landmarks of every iteration: odometry first, the result last."""
 
     @property
@@ -50,8 +50,9 @@ class SlamResult:
         """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed."""
         rows = np.arange(len(self.T_world_camera)) if rows is None else np.asarray(rows, dtype=np.int64)
         if len(rows) and (rows.min() < 0 or rows.max() >= len(self.T_world_camera)):
-            raise input_error("no such pose", got=[int(rows.min()), int(rows.max())],
-                              expected=f"0 to {len(self.T_world_camera) - 1}")
+            raise input_error(
+                "no such pose", got=[int(rows.min()), int(rows.max())], expected=f"0 to {len(self.T_world_camera) - 1}"
+            )
         return self.linearisation.covariance(self.linearisation.landmarks + rows)
 
     def landmark_covariances(self) -> Float[np.ndarray, "m 6 6"]:
@@ -80,9 +81,7 @@ class SlamResult:
                     position_covariance=R @ covariance[j, 3:, 3:] @ R.T,
                     oriented=bool(state.features.oriented[j]),
                     existence=float(existence[j]),
-                    class_posterior={c: float(p) for c, p in zip(state.prior.categories, classes[j])}
-                    if len(classes[j])
-                    else {},
+                    class_posterior={c: float(p) for c, p in zip(state.prior.categories, classes[j])} if len(classes[j]) else {},
                     latent=state.features.latent[j] if known else None,
                     latent_variance=state.features.latent_variance[j] if known else None,
                     size=sizes[j],
@@ -122,15 +121,12 @@ class SlamResult:
         error = predicted - table.position[rows]
         S = state.noise.position_covariance[rows]
         objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
-        log_ratio = (np.log(objectness) - np.log1p(-objectness) - np.log(state.noise.clutter_rate)
-                     + log_normal(error, S))
+        log_ratio = np.log(objectness) - np.log1p(-objectness) - np.log(state.noise.clutter_rate) + log_normal(error, S)
         log_odds = np.full(m, np.log(state.noise.new_rate))
         np.add.at(log_odds, state.landmark, state.weight * log_ratio)
         information = np.tile(1e-12 * np.eye(3), (m, 1, 1))
         R = state.estimate.T_world_camera[frame, :3, :3]
-        np.add.at(
-            information, state.landmark, state.weight[:, None, None] * (R @ np.linalg.inv(S) @ np.swapaxes(R, 1, 2))
-        )
+        np.add.at(information, state.landmark, state.weight[:, None, None] * (R @ np.linalg.inv(S) @ np.swapaxes(R, 1, 2)))
         log_odds += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
         return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700)))
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
-from nolbo_ppl.inference.slam.graph import Estimate, Links
+from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.tracking import Tracklets
@@ -38,7 +38,7 @@ class SlamState:
     """Their weights: probability of being that object rather than background."""
     features: TrackletFeatures
     """Features of the landmarks."""
-    estimate: Estimate
+    estimate: SlamEstimate
     """Poses and landmarks."""
     links: Links
     """Weighted links in use."""

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from nolbo_ppl.inference.slam.em import StepInfo, step
+from nolbo_ppl.inference.slam.em import EmStepInfo, step
 from nolbo_ppl.inference.slam.initialise import SlamState, first_estimate, init
 from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
@@ -14,10 +14,10 @@ from nolbo_ppl.inference.slam.slam_result import SlamResult
 
 
 def iterate(
-    state: SlamState, on_step: Callable[[SlamState, StepInfo], None] | None = None
-) -> tuple[SlamState, tuple[StepInfo, ...]]:
+    state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None
+) -> tuple[SlamState, tuple[EmStepInfo, ...]]:
     """Constellation rounds until they find nothing new, then the soft EM until the trajectory rests."""
-    infos: list[StepInfo] = []
+    infos: list[EmStepInfo] = []
     remaining = state.config.em_iterations
     if len(state.static) < 2:
         return state, ()
@@ -35,7 +35,7 @@ def iterate(
 
 
 def solve(
-    problem: SlamProblem, config: SlamConfig | None = None, on_step: Callable[[SlamState, StepInfo], None] | None = None
+    problem: SlamProblem, config: SlamConfig | None = None, on_step: Callable[[SlamState, EmStepInfo], None] | None = None
 ) -> SlamResult:
     """Odometry and observations in, corrected trajectory and map out.
 
@@ -56,12 +56,12 @@ def solve(
     return replace(result, seconds=seconds | result.seconds)
 
 
-def complete(state: SlamState, on_step: Callable[[SlamState, StepInfo], None] | None = None) -> SlamResult:
+def complete(state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None) -> SlamResult:
     """Iterate a state, finish it, and keep what every iteration held."""
     start = first_estimate(state.problem, state.noise, state.config, state.rows, state.landmark, len(state.static))
     history = [start]
 
-    def record(state: SlamState, info: StepInfo) -> None:
+    def record(state: SlamState, info: EmStepInfo) -> None:
         history.append(state.estimate)
         if on_step is not None:
             on_step(state, info)

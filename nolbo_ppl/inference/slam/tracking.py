@@ -18,7 +18,7 @@ from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_
 from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.orientation import (
     UNIFORM_LOG_DENSITY,
-    RotationModes,
+    OrientationModes,
     mixture_log_density,
     observed_modes,
     resolved_symmetry,
@@ -53,16 +53,14 @@ class Tracklets:
 class Tracker:
     """The live tracks, advanced frame by frame; what the batch front end and the online one share."""
 
-    def __init__(
-        self, config: SlamConfig, dimension: int, prior: FeaturePrior, new_rate: float, clutter_rate: float
-    ) -> None:
+    def __init__(self, config: SlamConfig, dimension: int, prior: FeaturePrior, new_rate: float, clutter_rate: float) -> None:
         self.config, self.prior = config, prior
         self.new_rate, self.clutter_rate = new_rate, clutter_rate
         self.index = np.zeros(0, dtype=np.int64)
         self.mean = np.zeros((0, 3))
         self.covariance = np.zeros((0, 3, 3))
         self.last = np.zeros(0, dtype=np.int64)
-        self.modes = RotationModes(np.zeros((0, 1)), np.zeros((0, 1, 3, 3)), np.zeros((0, 1)))
+        self.modes = OrientationModes(np.zeros((0, 1)), np.zeros((0, 1, 3, 3)), np.zeros((0, 1)))
         self.oriented = np.zeros(0, dtype=bool)
         self.latent = np.zeros((0, dimension))
         self.latent_variance = np.zeros((0, dimension))
@@ -89,7 +87,7 @@ class Tracker:
         self,
         position: Float[np.ndarray, "n 3"],
         covariance: Float[np.ndarray, "n 3 3"],
-        modes: RotationModes,
+        modes: OrientationModes,
         oriented: Bool[np.ndarray, " n"],
         symmetry: Int[np.ndarray, " n"],
         latent: Float[np.ndarray, "n d"],
@@ -118,8 +116,9 @@ class Tracker:
             both = np.flatnonzero(oriented[k] & self.oriented[j])
             if len(both):
                 value[both] += self._orientation(j[both], modes.select(k[both]), symmetry[k[both]])
-            value += self.prior.pair_log_ratio(latent[k], latent_variance[k], category[k], self.latent[j],
-                                               self.latent_variance[j], self.category[j])
+            value += self.prior.pair_log_ratio(
+                latent[k], latent_variance[k], category[k], self.latent[j], self.latent_variance[j], self.category[j]
+            )
             log_likelihood[k, j] = value
         if np.isfinite(log_likelihood).any():
             marginals = association_marginals(log_likelihood, log_null, associator=self.config.associator)
@@ -148,8 +147,12 @@ class Tracker:
             self.covariance = np.concatenate([self.covariance, covariance[rows]])
             self.last = np.concatenate([self.last, np.full(len(rows), frame)])
             self.oriented = np.concatenate([self.oriented, oriented[rows]])
-            self.modes = RotationModes(*(np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]])
-                                         for name in ("log_weight", "R", "scale")))
+            self.modes = OrientationModes(
+                *(
+                    np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]])
+                    for name in ("log_weight", "R", "scale")
+                )
+            )
             self.latent = np.concatenate([self.latent, latent[rows]])
             self.latent_variance = np.concatenate([self.latent_variance, latent_variance[rows]])
             self.category = np.concatenate([self.category, category[rows]])
@@ -162,25 +165,23 @@ class Tracker:
         self.mean[j] += gain @ (position - self.mean[j])
         self.covariance[j] = self.covariance[j] - gain @ self.covariance[j]
         self.covariance[j] = 0.5 * (self.covariance[j] + self.covariance[j].T)
-        self.latent[j], self.latent_variance[j] = fuse_latent(
-            self.latent[j], self.latent_variance[j], latent, latent_variance
-        )
+        self.latent[j], self.latent_variance[j] = fuse_latent(self.latent[j], self.latent_variance[j], latent, latent_variance)
         self.last[j] = frame
 
-    def _by_mode(self, tracks: np.ndarray, modes: RotationModes, symmetry: np.ndarray) -> np.ndarray:
+    def _by_mode(self, tracks: np.ndarray, modes: OrientationModes, symmetry: np.ndarray) -> np.ndarray:
         """Log density [n, K] of observed orientations given each mode of a track's, both widths added."""
         n, count = modes.log_weight.shape
         own = self.modes.select(tracks)
         seen = modes.select(np.repeat(np.arange(n), count))
-        wide = RotationModes(seen.log_weight, seen.R, np.hypot(seen.scale, own.scale.reshape(-1, 1)))
+        wide = OrientationModes(seen.log_weight, seen.R, np.hypot(seen.scale, own.scale.reshape(-1, 1)))
         return mixture_log_density(own.R.reshape(-1, 3, 3), wide, np.repeat(symmetry, count), self.config).reshape(n, count)
 
-    def _orientation(self, tracks: np.ndarray, modes: RotationModes, symmetry: np.ndarray) -> np.ndarray:
+    def _orientation(self, tracks: np.ndarray, modes: OrientationModes, symmetry: np.ndarray) -> np.ndarray:
         """Log ratio of observed orientations given tracks to any orientation."""
         joint = self.modes.log_weight[tracks] + self._by_mode(tracks, modes, symmetry)
         return np.logaddexp.reduce(joint, axis=1) - UNIFORM_LOG_DENSITY
 
-    def _orient(self, j: int, modes: RotationModes, symmetry: np.ndarray) -> None:
+    def _orient(self, j: int, modes: OrientationModes, symmetry: np.ndarray) -> None:
         """The first orientation founds the track's modes, later ones weigh them."""
         if not self.oriented[j]:
             self.oriented[j] = True
@@ -214,8 +215,17 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
             if rows is None:
                 continue
             assigned[rows], weight[rows] = tracker.associate(
-                world[rows], covariance[rows], modes.select(rows), oriented[rows], symmetry[rows], latent[rows],
-                latent_variance[rows], category[rows], objectness[rows], t)
+                world[rows],
+                covariance[rows],
+                modes.select(rows),
+                oriented[rows],
+                symmetry[rows],
+                latent[rows],
+                latent_variance[rows],
+                category[rows],
+                objectness[rows],
+                t,
+            )
     return summarise_tracks(problem, noise, config, assigned, weight)
 
 
@@ -239,9 +249,7 @@ def summarise_tracks(
     np.minimum.at(first, assigned[used], table.frame[used])
     np.maximum.at(last, assigned[used], table.frame[used])
     moving = moving_tracks(problem, noise, config, assigned, m)
-    return Tracklets(
-        assigned, np.where(used, weight, 0.0), first, last, count[keep] if total else np.zeros(0, int), moving
-    )
+    return Tracklets(assigned, np.where(used, weight, 0.0), first, last, count[keep] if total else np.zeros(0, int), moving)
 
 
 def moving_tracks(

@@ -9,9 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def component_log_prob(
-    value: Float[Tensor, "*batch d"], component_loc: Float[Tensor, "C d"]
-) -> Float[Tensor, "*batch C"]:
+def component_log_prob(value: Float[Tensor, "*batch d"], component_loc: Float[Tensor, "C d"]) -> Float[Tensor, "*batch C"]:
     """`log N(value; mu_c, I)` in nats for every component, NOLBO appendix I.
 
     The squared distance is one matrix product about the mean of the components, wrong by 1e-7 of their squared spread.
@@ -48,8 +46,6 @@ def enumerated_kl(kl: Float[Tensor, "*batch C"], log_weights: Float[Tensor, "*#b
     return -torch.logsumexp(log_weights - kl, -1)
 
 
-def label_posterior(
-    kl: Float[Tensor, "*batch C"], log_weights: Float[Tensor, "*#batch C"]
-) -> Float[Tensor, "*batch C"]:
+def label_posterior(kl: Float[Tensor, "*batch C"], log_weights: Float[Tensor, "*#batch C"]) -> Float[Tensor, "*batch C"]:
     """`log q(c)` of the optimal label posterior of `enumerated_kl`, normalised."""
     return torch.log_softmax(log_weights - kl, -1)

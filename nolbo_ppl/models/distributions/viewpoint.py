@@ -207,9 +207,7 @@ class ViewpointMixture(TorchDistribution):
             self._validate_sample(value)
         return self.azimuth.log_density(value[..., 0]) + self.elevation_inplane.log_prob(value[..., 1:]).sum(-1)
 
-    def log_prob_symmetric(
-        self, value: Float[Tensor, "... 3"], order: Int[Tensor, "*#batch"] | int
-    ) -> Float[Tensor, "*shape"]:
+    def log_prob_symmetric(self, value: Float[Tensor, "... 3"], order: Int[Tensor, "*#batch"] | int) -> Float[Tensor, "*shape"]:
         """Log density on the quotient by a symmetry about the vertical axis: azimuths that look the same are added."""
         azimuth = self.azimuth.log_prob_symmetric(value[..., 0], order)
         return azimuth + self.elevation_inplane.log_prob(value[..., 1:]).sum(-1)

@@ -160,9 +160,7 @@ class VonMisesMixture(TorchDistribution):
         concentration = self.concentration[..., None, :].expand(log_peak.shape)
         return log_peak.flatten(-2), concentration.flatten(-2), unit.expand(*log_peak.shape, 2).flatten(-3, -2)
 
-    def log_prob_symmetric(
-        self, value: Float[Tensor, "*value"], order: Int[Tensor, "*#batch"] | int
-    ) -> Float[Tensor, "*shape"]:
+    def log_prob_symmetric(self, value: Float[Tensor, "*value"], order: Int[Tensor, "*#batch"] | int) -> Float[Tensor, "*shape"]:
         """Log density of the azimuth of an object with a symmetry: `log sum_j q(v + 2 pi j / order)`.
 
         This is the density on the quotient of the circle by the group, an arc of 2 pi / order. Order 0, free about the

@@ -83,9 +83,7 @@ def mesh_to_shape(
     if len(faces) == 0:
         raise input_error("CAD mesh without faces", got=f"{len(vertices)} vertices", file=file)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise input_error(
-            "CAD mesh with faces past its vertices", got=int(faces.max()), expected=f"< {len(vertices)}", file=file
-        )
+        raise input_error("CAD mesh with faces past its vertices", got=int(faces.max()), expected=f"< {len(vertices)}", file=file)
     used = vertices[np.unique(faces)]
     if not np.isfinite(used).all():
         raise input_error("CAD mesh with vertices that are NaN or infinite", file=file)

@@ -30,7 +30,7 @@ VOXELS = 32
 
 
 @dataclass(frozen=True)
-class Item:
+class ShapeAsset:
     """A shape ready to be rendered."""
 
     shape: Shape
@@ -75,7 +75,7 @@ class ShapePool:
         counts = [self.count(category) for category in self.categories]
         self._first = dict(zip(self.categories, np.cumsum([0, *counts[:-1]]).tolist()))
         self.total: int = sum(counts)
-        self._kept: OrderedDict[tuple[str, int], Item] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, int], ShapeAsset] = OrderedDict()
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_kept": OrderedDict()}
@@ -84,7 +84,7 @@ class ShapePool:
         """Number of instances of a category."""
         return self.instances if self.cad is None else len(self.cad[category])
 
-    def item(self, category: str, number: int) -> Item:
+    def item(self, category: str, number: int) -> ShapeAsset:
         """Instance `number` of a category."""
         key = (category, number)
         if key not in self._kept:
@@ -93,21 +93,21 @@ class ShapePool:
             else:
                 shape = self.cad[category][number]
             mesh = Mesh(shape.vertices, shape.faces, shape.part)
-            self._kept[key] = Item(shape, mesh, self._first[category] + number)
+            self._kept[key] = ShapeAsset(shape, mesh, self._first[category] + number)
             if len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
         else:
             self._kept.move_to_end(key)
         return self._kept[key]
 
-    def draw(self, rng: np.random.Generator, block: int) -> Item:
+    def draw(self, rng: np.random.Generator, block: int) -> ShapeAsset:
         """A random instance, within the window of a block, of a random category; all categories equally likely."""
         category = self.categories[int(rng.integers(len(self.categories)))]
         count = self.count(category)
         within = int(rng.integers(min(WINDOW, count)))
         return self.item(category, (block * WINDOW + within) % count)
 
-    def item_of(self, number: int) -> Item:
+    def item_of(self, number: int) -> ShapeAsset:
         """The instance of that number over all categories."""
         category = next(name for name in reversed(self.categories) if self._first[name] <= number)
         return self.item(category, number - self._first[category])

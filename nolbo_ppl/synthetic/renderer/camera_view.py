@@ -46,7 +46,7 @@ class Mesh:
 
 
 @dataclass(frozen=True)
-class Placed:
+class MeshInstance:
     """A mesh in the camera frame: point = linear @ local + offset."""
 
     mesh: Mesh
@@ -150,7 +150,7 @@ class View:
     """A horizontal direction in the camera frame, along which the ground's texture runs."""
     camera_height: float
     """Height of the camera above the ground, scene units."""
-    placed: tuple[Placed, ...]
+    placed: tuple[MeshInstance, ...]
     lights: tuple[Light, ...]
     ambient_sky: Float[np.ndarray, " 3"]
     """Light from above where no lamp shines."""

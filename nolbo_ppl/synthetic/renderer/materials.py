@@ -59,6 +59,7 @@ class MaterialTable:
 
 def material_table(materials: Sequence[Material]) -> MaterialTable:
     """Stack materials into float32 arrays; the pattern becomes its index in `PATTERNS`."""
+
     def column(name: str) -> np.ndarray:
         return np.array([getattr(material, name) for material in materials], dtype=np.float32)
 
@@ -114,9 +115,7 @@ def _grey(rng: np.random.Generator, low: float, high: float) -> tuple[float, flo
 
 
 def _glossy(rng: np.random.Generator, albedo: tuple[float, float, float]) -> Material:
-    return Material(
-        albedo, specular=_between(rng, 0.1, 0.6), shininess=_between(rng, 15, 80), mirror=_between(rng, 0.0, 0.12)
-    )
+    return Material(albedo, specular=_between(rng, 0.1, 0.6), shininess=_between(rng, 15, 80), mirror=_between(rng, 0.0, 0.12))
 
 
 def _matt(rng: np.random.Generator, albedo: tuple[float, float, float], contrast: float = 0.0) -> Material:
@@ -133,9 +132,13 @@ def _wood(rng: np.random.Generator) -> Material:
     if rng.random() < 0.2:
         albedo = _grey(rng, 0.15, 0.95)
     return Material(
-        albedo, _between(rng, 0.02, 0.25), 20.0, pattern="wood",
-        contrast=_between(rng, 0.05, 0.35), frequency=_between(rng, 6, 20),
-    )  # fmt: skip
+        albedo,
+        _between(rng, 0.02, 0.25),
+        20.0,
+        pattern="wood",
+        contrast=_between(rng, 0.05, 0.35),
+        frequency=_between(rng, 6, 20),
+    )
 
 
 def _metal(rng: np.random.Generator, low: float, high: float) -> Material:
@@ -161,9 +164,15 @@ def _screen(rng: np.random.Generator) -> Material:
     if rng.random() < 0.35:  # switched on: a glowing picture
         albedo = hsv(rng.random(), _between(rng, 0.1, 0.7), _between(rng, 0.4, 0.9))
         return Material(
-            albedo, 0.3, 60.0, mirror=0.05, glow=_between(rng, 0.3, 0.9), pattern="noise",
-            contrast=_between(rng, 0.2, 0.9), frequency=_between(rng, 2, 8),
-        )  # fmt: skip
+            albedo,
+            0.3,
+            60.0,
+            mirror=0.05,
+            glow=_between(rng, 0.3, 0.9),
+            pattern="noise",
+            contrast=_between(rng, 0.2, 0.9),
+            frequency=_between(rng, 2, 8),
+        )
     return Material(_grey(rng, 0.03, 0.15), 0.5, 80.0, mirror=_between(rng, 0.05, 0.25))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from nolbo_ppl.synthetic.renderer import shading
-from nolbo_ppl.synthetic.renderer.camera_view import Placed, View
+from nolbo_ppl.synthetic.renderer.camera_view import MeshInstance, View
 from nolbo_ppl.synthetic.renderer.materials import stacked_table
 
 NEAR = 1e-3
@@ -54,7 +54,7 @@ def pixel_directions(
     return rays.reshape(-1, 3)
 
 
-def _first_hits(placed: Placed, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _first_hits(placed: MeshInstance, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Face (or -1) and depth of the first hit of rays from the camera with z = 1."""
     origin = (-(placed.inverse @ placed.offset)).astype(np.float32)
     local = directions @ placed.inverse.T.astype(np.float32)
@@ -66,7 +66,7 @@ def _first_hits(placed: Placed, directions: np.ndarray) -> tuple[np.ndarray, np.
     return hit["primID"], np.where(hit["primID"] >= 0, hit["tfar"], np.inf)
 
 
-def image_window(placed: Placed, intrinsics: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 4"] | None:
+def image_window(placed: MeshInstance, intrinsics: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 4"] | None:
     """Box [x0, y0, x1, y1] px of the projected vertices; None when some lie behind the camera."""
     points = placed.vertices
     if points[:, 2].min() <= NEAR:
@@ -75,7 +75,7 @@ def image_window(placed: Placed, intrinsics: Float[np.ndarray, " 4"]) -> Float[n
     return np.concatenate((pixels.min(axis=0), pixels.max(axis=0)))
 
 
-def _trace_window(placed: Placed, view: View) -> Float[np.ndarray, " 4"] | None:
+def _trace_window(placed: MeshInstance, view: View) -> Float[np.ndarray, " 4"] | None:
     """Box px of all that a mesh may cover, without bounds where it reaches behind the camera; None when out of sight."""
     window = image_window(placed, view.intrinsics)
     if window is not None:
@@ -124,11 +124,14 @@ def trace(view: View) -> Hits:
     owners = np.array([placed.owner for placed in view.placed] + [-1])
     visible = np.bincount(owners[index[index >= 0]] + 1, minlength=owners.max() + 2)
     return Hits(
-        depth, index, face, silhouette,
+        depth,
+        index,
+        face,
+        silhouette,
         owner_visible={p.owner: float(visible[p.owner + 1]) for p in view.placed if p.owner >= 0},
         owner_silhouette={p.owner: float(silhouette[k]) for k, p in enumerate(view.placed) if p.owner >= 0},
         windows=windows,
-    )  # fmt: skip
+    )
 
 
 def trace_pixels(
@@ -171,9 +174,7 @@ def trace_pixels(
     return rays[..., :2], index, face, depth
 
 
-def shadowed(
-    view: View, points: Float[np.ndarray, "n 3"], light: Float[np.ndarray, " 3"]
-) -> Bool[np.ndarray, " n"]:
+def shadowed(view: View, points: Float[np.ndarray, "n 3"], light: Float[np.ndarray, " 3"]) -> Bool[np.ndarray, " n"]:
     """Which points (camera frame, already lifted off their surface) a mesh hides from the light in that direction."""
     dark = np.zeros(len(points), dtype=bool)
     points, light = _f32(points, light)

@@ -136,9 +136,7 @@ def surfaces(
 
 
 @numba.njit(cache=True)
-def facing_points(
-    points: np.ndarray, normals: np.ndarray, kind: np.ndarray, light: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def facing_points(points: np.ndarray, normals: np.ndarray, kind: np.ndarray, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of meshes and ground that face the light, and their points lifted off the surface."""
     chosen = np.empty(len(points), dtype=np.int64)
     lifted = np.empty((len(points), 3), dtype=np.float32)

@@ -84,6 +84,13 @@ def sample_backdrop(
     elif kind == 3:
         picture = drawn_picture(rng, config.size, config.size)
     return Backdrop(
-        zenith, horizon, ground, wall, distance, normal, picture,
-        clouds=rng.uniform(0, 0.8) if rng.random() < 0.6 else 0.0, seed=int(rng.integers(2**31)),
-    )  # fmt: skip
+        zenith,
+        horizon,
+        ground,
+        wall,
+        distance,
+        normal,
+        picture,
+        clouds=rng.uniform(0, 0.8) if rng.random() < 0.6 else 0.0,
+        seed=int(rng.integers(2**31)),
+    )

@@ -38,8 +38,7 @@ _LAYOUT: dict[str, tuple[tuple[int, ...], type, float]] = {
 def empty_labels(scenes: int, slots: int = SLOTS) -> Arrays:
     """Label arrays [scenes, slots, ...] of scenes without objects, and `intrinsics` [scenes, 4]."""
     arrays: Arrays = {
-        name: np.full((scenes, slots, *shape), filling, dtype=dtype)
-        for name, (shape, dtype, filling) in _LAYOUT.items()
+        name: np.full((scenes, slots, *shape), filling, dtype=dtype) for name, (shape, dtype, filling) in _LAYOUT.items()
     }
     arrays["intrinsics"] = np.zeros((scenes, 4), dtype=np.float32)
     return arrays

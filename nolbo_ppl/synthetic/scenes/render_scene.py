@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.synthetic.assets.shape_library import Item
-from nolbo_ppl.synthetic.renderer.camera_view import Placed, View
+from nolbo_ppl.synthetic.assets.shape_library import ShapeAsset
+from nolbo_ppl.synthetic.renderer.camera_view import MeshInstance, View
 from nolbo_ppl.synthetic.renderer.ray_casting import Hits, average_down, image_window, shade, to_display, trace
 
 
@@ -28,7 +28,7 @@ class SceneObject:
     """Box centre in the camera frame, scene units."""
     diagonal: float
     """Box diagonal, scene units."""
-    item: Item
+    item: ShapeAsset
     """What it was drawn from."""
 
 
@@ -66,7 +66,7 @@ class ObjectLabel:
     visibility: float
     """Pixels seen over pixels of the silhouette without anything before it, its part beyond the border included."""
     symmetry: int
-    item: Item
+    item: ShapeAsset
     """The shape, with the number of the instance in its pool."""
 
 
@@ -81,7 +81,7 @@ class Rendered:
     """Number of the label each pixel shows, or -1 (at the first ray of the pixel)."""
 
 
-def amodal_box(placed: Placed, view: View) -> Float[np.ndarray, " 4"]:
+def amodal_box(placed: MeshInstance, view: View) -> Float[np.ndarray, " 4"]:
     """Tight box of the projected vertices, cut to the image."""
     window = image_window(placed, view.intrinsics)
     if window is None:
@@ -94,9 +94,12 @@ def _fine(view: View, factor: int) -> View:
     if factor == 1:
         return view
     return replace(
-        view, height=view.height * factor, width=view.width * factor, intrinsics=view.intrinsics * factor,
+        view,
+        height=view.height * factor,
+        width=view.width * factor,
+        intrinsics=view.intrinsics * factor,
         backdrop=replace(view.backdrop, picture=_enlarge(view.backdrop.picture, factor)),
-    )  # fmt: skip
+    )
 
 
 def _enlarge(picture: np.ndarray | None, factor: int) -> np.ndarray | None:
@@ -159,7 +162,14 @@ def render_scene(scene: Scene) -> Rendered:
 def _label(thing: SceneObject, box: np.ndarray, visibility: float) -> ObjectLabel:
     shape = thing.item.shape
     return ObjectLabel(
-        category=shape.category, instance=shape.instance, box=box, R_camera_object=thing.R_camera_object,
-        position=thing.centre * (shape.diagonal / thing.diagonal), size=shape.diagonal, dimensions=shape.dimensions,
-        visibility=min(1.0, visibility), symmetry=shape.symmetry, item=thing.item,
-    )  # fmt: skip
+        category=shape.category,
+        instance=shape.instance,
+        box=box,
+        R_camera_object=thing.R_camera_object,
+        position=thing.centre * (shape.diagonal / thing.diagonal),
+        size=shape.diagonal,
+        dimensions=shape.dimensions,
+        visibility=min(1.0, visibility),
+        symmetry=shape.symmetry,
+        item=thing.item,
+    )

@@ -93,10 +93,23 @@ class SceneConfig:
 def easy(size: int = 128) -> SceneConfig:
     """Up to three upright, whole objects on plain ground, little clutter: what the feasibility study learnt from."""
     return SceneConfig(
-        size=size, objects=(1, 3), clutter=(0, 1), object_pixels=(20.0, 0.85), elevation=(8.0, 40.0),
-        steep_probability=0.0, roll=2.0, near_probability=0.1, truncation_probability=0.0, least_visibility=0.4,
-        backgrounds=(0.8, 0.2, 0.0, 0.0), muted=1.0, second_light_probability=0.0, tint=0.05, blur=0.0, noise=0.005,
-    )  # fmt: skip
+        size=size,
+        objects=(1, 3),
+        clutter=(0, 1),
+        object_pixels=(20.0, 0.85),
+        elevation=(8.0, 40.0),
+        steep_probability=0.0,
+        roll=2.0,
+        near_probability=0.1,
+        truncation_probability=0.0,
+        least_visibility=0.4,
+        backgrounds=(0.8, 0.2, 0.0, 0.0),
+        muted=1.0,
+        second_light_probability=0.0,
+        tint=0.05,
+        blur=0.0,
+        noise=0.005,
+    )
 
 
 def standard(size: int = 128) -> SceneConfig:
@@ -107,11 +120,29 @@ def standard(size: int = 128) -> SceneConfig:
 def full(size: int = 128) -> SceneConfig:
     """Everything at random: heavy clutter and occlusion, truncation, drawn or photographic pictures, coloured light."""
     return SceneConfig(
-        size=size, objects=(1, 6), clutter=(0, 8), object_pixels=(12.0, 1.0), focal=(0.6, 3.0), elevation=(0.0, 50.0),
-        steep_probability=0.12, steep_elevation=85.0, roll=8.0, near_probability=0.45, truncation_probability=0.3,
-        least_visibility=0.1, least_box=4.0, backgrounds=(0.15, 0.3, 0.2, 0.35), photographs=0.7, muted=0.4,
-        sun_elevation=(10.0, 88.0), second_light_probability=0.4, tint=0.3, exposure=(0.5, 1.6), blur=0.9, noise=0.035,
-    )  # fmt: skip
+        size=size,
+        objects=(1, 6),
+        clutter=(0, 8),
+        object_pixels=(12.0, 1.0),
+        focal=(0.6, 3.0),
+        elevation=(0.0, 50.0),
+        steep_probability=0.12,
+        steep_elevation=85.0,
+        roll=8.0,
+        near_probability=0.45,
+        truncation_probability=0.3,
+        least_visibility=0.1,
+        least_box=4.0,
+        backgrounds=(0.15, 0.3, 0.2, 0.35),
+        photographs=0.7,
+        muted=0.4,
+        sun_elevation=(10.0, 88.0),
+        second_light_probability=0.4,
+        tint=0.3,
+        exposure=(0.5, 1.6),
+        blur=0.9,
+        noise=0.035,
+    )
 
 
 def rendered_size(image_size: int) -> int:

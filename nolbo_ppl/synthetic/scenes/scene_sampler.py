@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.synthetic.assets.shape_library import BLOCK, ShapePool
-from nolbo_ppl.synthetic.renderer.camera_view import Mesh, Placed, View
+from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance, View
 from nolbo_ppl.synthetic.renderer.materials import sample_material, sample_materials
 from nolbo_ppl.synthetic.scenes import distractors as clutter
 from nolbo_ppl.synthetic.scenes.background_images import Photographs
@@ -114,7 +114,7 @@ class _Composer:
 
 def _object(
     composer: _Composer, pool: ShapePool, block: int, owner: int, config: SceneConfig, rng: np.random.Generator
-) -> tuple[SceneObject, Placed] | None:
+) -> tuple[SceneObject, MeshInstance] | None:
     """Draw one labelled object and its place."""
     item = pool.draw(rng, block)
     shape = item.shape
@@ -137,7 +137,7 @@ def _object(
         return None
     centre, diagonal = place
     R_camera_object = composer.R_camera_world @ R_world_object
-    placed = Placed(item.mesh, R_camera_object * diagonal, centre, materials, owner, texture_seed)
+    placed = MeshInstance(item.mesh, R_camera_object * diagonal, centre, materials, owner, texture_seed)
     return SceneObject(R_camera_object, centre, diagonal, item), placed
 
 
@@ -156,7 +156,7 @@ def _unit_mesh(kind: str) -> Mesh:
     return _UNIT_MESHES[kind]
 
 
-def _clutter(composer: _Composer, config: SceneConfig, rng: np.random.Generator) -> list[Placed]:
+def _clutter(composer: _Composer, config: SceneConfig, rng: np.random.Generator) -> list[MeshInstance]:
     """Draw one piece of clutter and its place."""
     parts, box = clutter.sample_clutter(rng)
     roles = rng.choice(["body", "wood", "metal", "fabric", "trim"], size=len(parts), p=[0.4, 0.2, 0.1, 0.2, 0.1])
@@ -171,7 +171,7 @@ def _clutter(composer: _Composer, config: SceneConfig, rng: np.random.Generator)
     centre, diagonal = place
     linear = composer.R_camera_world @ R_world_local * diagonal
     return [
-        Placed(_unit_mesh(p.kind), linear @ p.linear, linear @ p.offset + centre, (material,), -1, texture_seed)
+        MeshInstance(_unit_mesh(p.kind), linear @ p.linear, linear @ p.offset + centre, (material,), -1, texture_seed)
         for p, material in zip(parts, materials)
     ]
 
@@ -194,7 +194,7 @@ def sample_scene(
     """
     composer = _Composer(config, rng)
     objects: list[SceneObject] = []
-    placed: list[Placed] = []
+    placed: list[MeshInstance] = []
     empty = rng.random() < config.empty_probability
     wanted = 0 if empty else int(rng.integers(config.objects[0], config.objects[1] + 1))
     for _ in range(wanted):
@@ -208,19 +208,31 @@ def sample_scene(
     backdrop = sample_backdrop(config, rng, composer.R_camera_world, photographs)
     angle = rng.uniform(-np.pi, np.pi)
     view = View(
-        height=config.size, width=config.size, intrinsics=composer.intrinsics, up=composer.up,
-        north=composer.R_camera_world @ np.array([np.cos(angle), np.sin(angle), 0.0]), camera_height=CAMERA_HEIGHT,
-        placed=tuple(placed), lights=lights, ambient_sky=ambient_sky, ambient_ground=ambient_ground, backdrop=backdrop,
-    )  # fmt: skip
+        height=config.size,
+        width=config.size,
+        intrinsics=composer.intrinsics,
+        up=composer.up,
+        north=composer.R_camera_world @ np.array([np.cos(angle), np.sin(angle), 0.0]),
+        camera_height=CAMERA_HEIGHT,
+        placed=tuple(placed),
+        lights=lights,
+        ambient_sky=ambient_sky,
+        ambient_ground=ambient_ground,
+        backdrop=backdrop,
+    )
     return Scene(
-        view=view, objects=tuple(objects), exposure=rng.uniform(*config.exposure), blur=rng.uniform(0, config.blur),
-        noise=rng.uniform(0, config.noise), noise_seed=int(rng.integers(2**63)), supersample=config.supersample,
-        least_visibility=config.least_visibility, least_box=config.least_box,
-    )  # fmt: skip
+        view=view,
+        objects=tuple(objects),
+        exposure=rng.uniform(*config.exposure),
+        blur=rng.uniform(0, config.blur),
+        noise=rng.uniform(0, config.noise),
+        noise_seed=int(rng.integers(2**63)),
+        supersample=config.supersample,
+        least_visibility=config.least_visibility,
+        least_box=config.least_box,
+    )
 
 
-def scene_at(
-    config: SceneConfig, seed: int, index: int, pool: ShapePool, photographs: Photographs | None = None
-) -> Scene:
+def scene_at(config: SceneConfig, seed: int, index: int, pool: ShapePool, photographs: Photographs | None = None) -> Scene:
     """Scene `index` of seed `seed`: depends on nothing else, however many processes share the work."""
     return sample_scene(config, np.random.default_rng([seed, index]), pool, photographs, index // BLOCK)

@@ -12,9 +12,7 @@ from nolbo_ppl.synthetic.shapes.shape_builder import Builder, Draw
 
 def aeroplane(b: Builder, d: Draw) -> int:
     """Add one aeroplane; returns its symmetry."""
-    style = d.choice(
-        airliner=0.34, business=0.16, highwing=0.14, lowwing=0.12, turboprop=0.1, fighter=0.09, biplane=0.05
-    )
+    style = d.choice(airliner=0.34, business=0.16, highwing=0.14, lowwing=0.12, turboprop=0.1, fighter=0.09, biplane=0.05)
     family = {"airliner": airliner, "business": airliner, "turboprop": airliner, "fighter": _fighter}.get(style, _light)
     family(b, d, style)
     return 1
@@ -92,9 +90,7 @@ def _light(b: Builder, d: Draw, style: str) -> None:
     fin_c = 0.13 * length
     fin_y = y1 - fin_c - 0.01 * length
     add_fin(b, fin_y, fin_c, 0.4 * radius, d(1.5, 2.2) * radius, d(0.3, 0.7), d(0.4, 0.7), 0.02 * length)
-    add_wing(
-        b, fin_y + 0.01 * length, 0.8 * fin_c, span * d(0.3, 0.38), d(0.05, 0.3), 0.7, 0.5 * radius, 0.0, 0.018 * length
-    )
+    add_wing(b, fin_y + 0.01 * length, 0.8 * fin_c, span * d(0.3, 0.38), d(0.05, 0.3), 0.7, 0.5 * radius, 0.0, 0.018 * length)
     drop, wheel = d(0.9, 1.3) * radius, 0.035 * length
     if style == "biplane" or d.chance(0.3):
         add_gear(b, y1 - 0.06 * length, root + 0.05 * chord, 1.1 * radius, -0.6 * radius, drop, wheel)
@@ -137,9 +133,7 @@ def _fighter(b: Builder, d: Draw, style: str) -> None:
         ],
         segments=10,
     )
-    b.pair(
-        "grille", (0.8 * radius, 1.5 * radius), (y0 + 0.31 * length, y0 + 0.34 * length), (-0.6 * radius, 0.5 * radius)
-    )
+    b.pair("grille", (0.8 * radius, 1.5 * radius), (y0 + 0.31 * length, y0 + 0.34 * length), (-0.6 * radius, 0.5 * radius))
     b.pair(
         "body",
         (0.7 * radius, 1.55 * radius),

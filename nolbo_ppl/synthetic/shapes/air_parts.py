@@ -62,9 +62,7 @@ def add_wing(
         )
 
 
-def add_fin(
-    b: Builder, y: float, chord: float, z: float, height: float, sweep: float, taper: float, thick: float
-) -> float:
+def add_fin(b: Builder, y: float, chord: float, z: float, height: float, sweep: float, taper: float, thick: float) -> float:
     """Add the vertical tail in the second colour; returns the y of its tip."""
     tip = y + sweep * height
     b.side("body2", [(y, z), (tip, z + height), (tip + taper * chord, z + height), (y + chord, z)], 0.5 * thick)

@@ -100,6 +100,4 @@ def airliner(b: Builder, d: Draw, style: str) -> None:
             decal=True,
         )
     if d.chance(0.5):
-        add_gear(
-            b, y0 + 0.12 * length, root + 0.75 * chord, 1.2 * radius, -0.9 * radius, d(0.7, 1.0) * radius, 0.28 * radius
-        )
+        add_gear(b, y0 + 0.12 * length, root + 0.75 * chord, 1.2 * radius, -0.9 * radius, d(0.7, 1.0) * radius, 0.28 * radius)

@@ -41,9 +41,7 @@ def _axles(b: Builder, d: Draw, half: float, ys: tuple[float, ...], radius: floa
 
 def _tail(b: Builder, d: Draw, rear: float, half: float, floor: float, height: float, window: bool) -> None:
     """Add the blind back: a small high window, the engine grille, red lamps."""
-    b.box(
-        "body2", (-half + 0.04, half - 0.04), (rear - 0.3, rear + PROUD), (floor + 0.1, floor + 0.62 * (height - floor))
-    )
+    b.box("body2", (-half + 0.04, half - 0.04), (rear - 0.3, rear + PROUD), (floor + 0.1, floor + 0.62 * (height - floor)))
     b.box(
         "grille",
         (-half * 0.72, half * 0.72),
@@ -53,9 +51,7 @@ def _tail(b: Builder, d: Draw, rear: float, half: float, floor: float, height: f
     )
     red_h = d(0.35, 0.8)
     b.pair("light_rear", (half - 0.34, half - 0.06), (rear - 0.2, rear + 2 * PROUD), (floor + 0.6, floor + 0.6 + red_h))
-    b.pair(
-        "light_rear", (half - 0.4, half - 0.06), (rear - 0.2, rear + PROUD), (height - 0.22, height - 0.1), decal=True
-    )
+    b.pair("light_rear", (half - 0.4, half - 0.06), (rear - 0.2, rear + PROUD), (height - 0.22, height - 0.1), decal=True)
     b.box("trim", (-half - 0.01, half + 0.01), (rear - 0.3, rear + 0.1), (floor - 0.04, floor + 0.3))
     if window:
         top = height - 0.3
@@ -134,13 +130,9 @@ def _box_bus(b: Builder, d: Draw, style: str) -> None:
     if style in ("city", "double") and d.chance(0.7):
         y = d(-0.05, 0.15) * length
         b.box("trim", (-half - 1.5 * PROUD, -half + 0.1), (y, y + 1.2), (floor + 0.1, top - 0.1), decal=True)
-    b.pair(
-        "body2", (half - 0.2, half + 0.8 * PROUD), (engine + 0.1, rear - 0.08), (floor + 0.1, height - 0.3), decal=True
-    )
+    b.pair("body2", (half - 0.2, half + 0.8 * PROUD), (engine + 0.1, rear - 0.08), (floor + 0.1, height - 0.3), decal=True)
     if d.chance(0.6):
-        b.pair(
-            "body2", (half - 0.2, half + 0.8 * PROUD), (door, engine), (floor + 0.1, floor + d(0.3, 0.6)), decal=True
-        )
+        b.pair("body2", (half - 0.2, half + 0.8 * PROUD), (door, engine), (floor + 0.1, floor + d(0.3, 0.6)), decal=True)
     b.tubes(
         "trim",
         [

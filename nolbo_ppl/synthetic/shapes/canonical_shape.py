@@ -140,9 +140,7 @@ class Shape:
         return (self.vertices.max(axis=0) - self.vertices.min(axis=0)) * self.diagonal
 
 
-def assemble(
-    category: str, instance: str, solids: Sequence[Primitive], decals: Sequence[Primitive], symmetry: int
-) -> Shape:
+def assemble(category: str, instance: str, solids: Sequence[Primitive], decals: Sequence[Primitive], symmetry: int) -> Shape:
     """Join primitives in metres into one shape in its canonical frame; decals are drawn but fill no voxels.
 
     Raises:

@@ -91,9 +91,7 @@ def tvmonitor(b: Builder, d: Draw) -> int:
     for i in range(4):
         z = mid + h * c * (0.1 + 0.2 * i)
         b.box("grille", (-w * a * 0.75, w * a * 0.75), (y - 0.01, y + proud), (z, z + 0.11 * h * c), decal=True)
-    b.box(
-        "label", (-w * a * 0.5, w * a * 0.1), (y - 0.01, y + proud), (mid - 0.6 * h * c, mid - 0.25 * h * c), decal=True
-    )
+    b.box("label", (-w * a * 0.5, w * a * 0.1), (y - 0.01, y + proud), (mid - 0.6 * h * c, mid - 0.25 * h * c), decal=True)
     b.box(
         "light_front",
         (w * 0.82, w * 0.87),

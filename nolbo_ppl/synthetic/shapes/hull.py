@@ -55,9 +55,7 @@ def add_hull(
     return stations
 
 
-def add_deck(
-    b: Builder, stations: list[tuple[float, float, float]], inset: float, lift: float, role: str = "deck"
-) -> None:
+def add_deck(b: Builder, stations: list[tuple[float, float, float]], inset: float, lift: float, role: str = "deck") -> None:
     """Add the deck as a thin lid that follows the sheer."""
     b.loft(
         1,

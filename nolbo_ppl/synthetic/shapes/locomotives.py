@@ -46,9 +46,7 @@ def hood_locomotive(b: Builder, d: Draw, style: str) -> None:
     n = d.integer(3, 5)
     for i in range(n):
         y = cab + deep + 0.6 + i * (y1 - 1.6 - cab - deep) / n
-        b.pair(
-            "grille", (hood_half - 0.1, hood_half + PROUD), (y, y + 1.0), (hood_top - 1.3, hood_top - 0.3), decal=True
-        )
+        b.pair("grille", (hood_half - 0.1, hood_half + PROUD), (y, y + 1.0), (hood_top - 1.3, hood_top - 0.3), decal=True)
     b.box("body2", (-hood_half - 0.25, hood_half + 0.25), (y1 - 3.2, y1 - 1.6), (hood_top - 0.5, hood_top + 0.15))
     b.cylinder(2, "dark_metal", (0, 0.1 * length, hood_top + 0.15), 0.3, 0.3, segments=8)
     b.tubes(
@@ -152,9 +150,7 @@ def steam_locomotive(b: Builder, d: Draw, style: str) -> None:
     for i in range(n):
         for sign in (-1.0, 1.0):
             b.cylinder(0, "body2", (sign * half * 0.82, first + i * pitch, drive), drive, 0.09, segments=14)
-    b.pair(
-        "metal", (half * 0.9, half * 0.96), (first - 0.1, first + (n - 1) * pitch + 0.1), (drive - 0.1, drive + 0.08)
-    )
+    b.pair("metal", (half * 0.9, half * 0.96), (first - 0.1, first + (n - 1) * pitch + 0.1), (drive - 0.1, drive + 0.08))
     for sign in (-1.0, 1.0):
         b.cylinder(1, "dark_metal", (sign * half * 0.85, y0 + 0.8, frame * 0.75), 0.32, 0.5, segments=8)
     b.side("trim", [(y0 - 0.9, 0.15), (y0 - 0.3, frame), (y0, frame), (y0, 0.15)], (half * 0.9 - 0.15 * y0, 0.15, 0.0))
@@ -180,8 +176,6 @@ def steam_locomotive(b: Builder, d: Draw, style: str) -> None:
         )
         for i in range(3):
             for sign in (-1.0, 1.0):
-                b.cylinder(
-                    0, "metal", (sign * half * 0.75, t0 + tender_l * (0.15 + 0.3 * i), 0.48), 0.48, 0.08, segments=10
-                )
+                b.cylinder(0, "metal", (sign * half * 0.75, t0 + tender_l * (0.15 + 0.3 * i), 0.48), 0.48, 0.08, segments=10)
     b.box("body2", (-half, half), (y0 + length - 0.1, y0 + length + 0.15), (frame - 0.1, frame + 0.35))
     b.pair("light_rear", (half * 0.6, half * 0.9), (y0 + length, y0 + length + 0.3), (frame + 0.35, frame + 0.8))

@@ -68,9 +68,7 @@ def motorbike(b: Builder, d: Draw) -> int:
         )
     angles = [math.radians(40 + 110 * i / 5) for i in range(6)]
     fender = r_f + (0.12 if style == "enduro" else 0.025)
-    b.tube(
-        "body", [(0, y_f + fender * math.cos(a), r_f + fender * math.sin(a)) for a in angles], t_f + 0.015, segments=6
-    )
+    b.tube("body", [(0, y_f + fender * math.cos(a), r_f + fender * math.sin(a)) for a in angles], t_f + 0.015, segments=6)
     return 1
 
 

@@ -68,9 +68,7 @@ def _express(b: Builder, d: Draw, style: str) -> None:
     if d.chance(0.75):
         add_windows(b, d, half, (y0 + nose + 0.8, y1 - 1.2), (z, z + d(0.7, 0.95)), d.integer(1, 2))
     stripe = d(0.9, 1.3)
-    b.pair(
-        "body2", (half - 0.1, half + 0.7 * PROUD), (y0 + nose, y1 - 0.3), (stripe, stripe + d(0.15, 0.4)), decal=True
-    )
+    b.pair("body2", (half - 0.1, half + 0.7 * PROUD), (y0 + nose, y1 - 0.3), (stripe, stripe + d(0.15, 0.4)), decal=True)
     add_bogies(b, d, y0 + nose * 0.9 + 1.0, y1 - 2.8, half)
     add_roof_gear(b, d, height, y1 - d(3.0, 8.0), electric=d.chance(0.6))
     add_rear(b, d, y1, half, floor + 0.5, height)
@@ -126,9 +124,7 @@ def _unit(b: Builder, d: Draw, style: str) -> None:
     )
     b.pair("glass", (half - 0.1, half + 1.5 * PROUD), (mid + 0.35, mid + 1.0), (sill + 0.1, top - 0.15), decal=True)
     lamp = d(0.2, 0.34)
-    b.pair(
-        "light_front", (half - 0.25 - 2 * lamp, half - 0.2), (y0 - PROUD, y0 + 0.3), (sill - 0.2 - lamp, sill - 0.15)
-    )
+    b.pair("light_front", (half - 0.25 - 2 * lamp, half - 0.2), (y0 - PROUD, y0 + 0.3), (sill - 0.2 - lamp, sill - 0.15))
     if style != "tram":
         b.box("light_front", (-lamp, lamp), (y0 + rake - 2 * PROUD, y0 + rake + 0.3), (height - 0.28, height - 0.05))
         b.box("dark_metal", (-half * 0.85, half * 0.85), (y0 - 0.3, y0 + 0.4), (floor - 0.55, floor + 0.05))

@@ -137,9 +137,7 @@ def _saloon(b: Builder, d: Draw, style: str) -> None:
     for i in range(doors):
         y = cowl + rake * 0.7 + (foot - back_rake * 0.6 - cowl - rake * 0.7) * (i + 1) / (doors + 1)
         b.tubes("body", [on_glass(y, belt), on_glass(y + 0.05, height - 0.03)], bar, segments=5)
-    _lamps(
-        b, d, front, rear, half - 0.02, nose, belt if bed or style in ("hatchback", "estate", "suv") else boot, ground
-    )
+    _lamps(b, d, front, rear, half - 0.02, nose, belt if bed or style in ("hatchback", "estate", "suv") else boot, ground)
     overhang = length * d(0.15, 0.19)
     _wheels(b, d, front + overhang, rear - length * d(0.16, 0.22), half, radius)
     _mirrors(b, cowl + 0.35 * rake, belt + 0.02, half)

@@ -137,9 +137,7 @@ def rowing_boat(b: Builder, d: Draw) -> None:
     )
     if d.chance(0.7):
         reach, lift = beam * d(0.75, 1.1), depth * d(0.6, 1.4)
-        b.tubes(
-            "wood", [(0.25 * beam, 0.02 * length, depth * 1.5), (reach, 0.1 * length, lift)], 0.009 * length, segments=4
-        )
+        b.tubes("wood", [(0.25 * beam, 0.02 * length, depth * 1.5), (reach, 0.1 * length, lift)], 0.009 * length, segments=4)
         b.pair(
             "wood",
             (reach - 0.02 * length, reach + 0.12 * length),
@@ -148,6 +146,4 @@ def rowing_boat(b: Builder, d: Draw) -> None:
         )
     if d.chance(0.35):
         b.box("trim", (-0.05 * length, 0.05 * length), (0.5 * length, 0.58 * length), (0.6 * depth, depth * 1.7))
-        b.box(
-            "dark_metal", (-0.018 * length, 0.018 * length), (0.51 * length, 0.55 * length), (-0.5 * depth, 0.7 * depth)
-        )
+        b.box("dark_metal", (-0.018 * length, 0.018 * length), (0.51 * length, 0.55 * length), (-0.5 * depth, 0.7 * depth))

@@ -90,9 +90,7 @@ def _pedestal(b: Builder, d: Draw, z: float) -> None:
         b.ellipsoid("trim", (tip[0], tip[1], 0.03), (0.03, 0.03, 0.03), segments=6)
 
 
-def _back(
-    b: Builder, d: Draw, style: str, half: float, rear: float, seat: float, top: float, lean: float, frame: str
-) -> None:
+def _back(b: Builder, d: Draw, style: str, half: float, rear: float, seat: float, top: float, lean: float, frame: str) -> None:
     """Add the back rest, leaning to +y: a padded shell, vertical spindles, ladder slats or a bar."""
     thick = d(0.02, 0.035) if style != "lounge" else d(0.06, 0.12)
 
@@ -129,9 +127,7 @@ def _back(
         count = d.integer(3, 6)
         for i in range(count):
             x = (half - 2 * post) * (2 * (i + 1) / (count + 1) - 1)
-            b.tube(
-                frame, [(x, at(seat) + post, seat - 0.08), (x, at(top) + post, top - 0.03)], d(0.009, 0.016), segments=5
-            )
+            b.tube(frame, [(x, at(seat) + post, seat - 0.08), (x, at(top) + post, top - 0.03)], d(0.009, 0.016), segments=5)
     elif kind == "ladder":
         count = d.integer(2, 4)
         for i in range(count):

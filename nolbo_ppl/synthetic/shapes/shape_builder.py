@@ -134,9 +134,7 @@ class Builder:
         caps = (roles[0], roles[-1]) if caps is None else (caps, caps) if isinstance(caps, str) else caps
         polygon = None if section is None else np.asarray(section, dtype=np.float64)
         return self._add(
-            Loft(
-                axis, np.asarray(stations, dtype=np.float64), centres, halves, exponent, polygon, segments, roles, caps
-            ),
+            Loft(axis, np.asarray(stations, dtype=np.float64), centres, halves, exponent, polygon, segments, roles, caps),
             decal,
         )
 
@@ -211,9 +209,7 @@ class Builder:
         self.tube(role, path, radius, segments=segments)
         return self.tube(role, [(-x, y, z) for x, y, z in path], radius, segments=segments)
 
-    def torus(
-        self, axis: int, role: str, centre: Triple, ring: float, tube: float, *, segments: Pair = (18, 5)
-    ) -> Self:
+    def torus(self, axis: int, role: str, centre: Triple, ring: float, tube: float, *, segments: Pair = (18, 5)) -> Self:
         """Add a ring: `ring` is the radius to the middle of the tube, `tube` the radius of the tube."""
         return self._add(Torus(axis, centre, ring, tube, role, (int(segments[0]), int(segments[1]))), False)
 
@@ -221,6 +217,4 @@ class Builder:
         """Add a road wheel standing on z = 0 with its outer side at |x|: tyre, and a rim standing proud of it."""
         sign = math.copysign(1.0, x)
         self.cylinder(0, "tyre", (x - sign * 0.5 * width, y, radius), radius, 0.5 * width, segments=segments)
-        return self.cylinder(
-            0, "rim", (x - sign * 0.4 * width, y, radius), rim * radius, 0.5 * width, segments=10, decal=True
-        )
+        return self.cylinder(0, "rim", (x - sign * 0.4 * width, y, radius), rim * radius, 0.5 * width, segments=10, decal=True)

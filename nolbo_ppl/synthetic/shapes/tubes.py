@@ -46,9 +46,7 @@ class Tube:
         for point, t, r in zip(self.path, tangent, self.radius * mitre):
             side = side - (side @ t) * t
             side /= math.sqrt(side @ side)
-            up = np.array(
-                [t[1] * side[2] - t[2] * side[1], t[2] * side[0] - t[0] * side[2], t[0] * side[1] - t[1] * side[0]]
-            )
+            up = np.array([t[1] * side[2] - t[2] * side[1], t[2] * side[0] - t[0] * side[2], t[0] * side[1] - t[1] * side[0]])
             rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up))
         k, n = len(self.path), self.segments
         faces = rings_to_faces(k, n, capped=True)

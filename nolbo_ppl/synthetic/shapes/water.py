@@ -142,9 +142,7 @@ def _speed(b: Builder, d: Draw) -> None:
             0.007 * length,
             segments=4,
         )
-        b.tubes(
-            "metal", [(half, end - 0.1 * length, depth), (half, end - 0.14 * length, top)], 0.007 * length, segments=4
-        )
+        b.tubes("metal", [(half, end - 0.1 * length, depth), (half, end - 0.14 * length, top)], 0.007 * length, segments=4)
         b.box(
             "fabric",
             (-half * 1.05, half * 1.05),

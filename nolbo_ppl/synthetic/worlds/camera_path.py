@@ -93,9 +93,7 @@ def rounded_polygon(corners: Float[np.ndarray, "c 2"], radius: float) -> Loop:
     return Loop(sampled, np.interp(s, distance, direction), length)
 
 
-def random_loop(
-    perimeter: float, radius: float, rng: np.random.Generator, aspect: tuple[float, float], jitter: float
-) -> Loop:
+def random_loop(perimeter: float, radius: float, rng: np.random.Generator, aspect: tuple[float, float], jitter: float) -> Loop:
     """A four-sided loop of about the given length, driven round either way.
 
     Args:
@@ -149,9 +147,7 @@ def drive_track(loop: Loop, laps: float, opposite: float, lane: float) -> Track:
     around = centre + 0.5 * lane * np.stack((np.cos(arc), np.sin(arc)), axis=1)
     back = np.linspace(end, end - opposite * loop.length, max(2, int(opposite * loop.length / SPACING)))
     returning, reverse = loop.at(back, lane)
-    return Track(
-        np.concatenate((points, around, returning)), np.concatenate((headings, heading + angle, reverse + np.pi))
-    )
+    return Track(np.concatenate((points, around, returning)), np.concatenate((headings, heading + angle, reverse + np.pi)))
 
 
 def _wave(distance: np.ndarray, wavelengths: tuple[float, ...], rng: np.random.Generator) -> np.ndarray:

@@ -93,9 +93,18 @@ def _floor(builder: StaticBuilder, loop: Loop, rng: np.random.Generator) -> np.n
         pattern, frequency = [("lattice", 4.0), ("grain", 5.0), ("slabs", 6.0), ("stripes", 3.0)][int(rng.integers(4))]
         for scale, z, colour in (
             (1.0, 0.0, Material(hsv(rng.random(), 0.6, rng.uniform(0.2, 0.5)))),
-            (0.86, 0.003, Material(hsv(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.4, 0.8)), 0.0,
-                                   pattern=pattern, contrast=0.5, frequency=frequency)),
-        ):  # fmt: skip
+            (
+                0.86,
+                0.003,
+                Material(
+                    hsv(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.4, 0.8)),
+                    0.0,
+                    pattern=pattern,
+                    contrast=0.5,
+                    frequency=frequency,
+                ),
+            ),
+        ):
             corner = [frame(scale * a * x, scale * b * y, z) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
             builder.polygon(np.array(corner), colour)
     return corners
@@ -108,8 +117,9 @@ def _dress(builder: StaticBuilder, wall: Frame, length: float, rng: np.random.Ge
     while x < length / 2 - 1.0:
         kind = rng.random()
         if kind < 0.18 and x < length / 2 - 1.4:
-            door = Material(hsv(rng.uniform(0.05, 0.1), 0.4, rng.uniform(0.4, 0.9)), 0.1, pattern="planks", contrast=0.15,
-                            frequency=4.0)  # fmt: skip
+            door = Material(
+                hsv(rng.uniform(0.05, 0.1), 0.4, rng.uniform(0.4, 0.9)), 0.1, pattern="planks", contrast=0.15, frequency=4.0
+            )
             builder.box(wall, (x, -0.05, 0), (x + 1.05, 0, 2.15), SKIRTING)
             builder.box(wall, (x + 0.08, -0.07, 0), (x + 0.97, 0, 2.05), door)
             builder.solid("ball", wall, (x + 0.87, -0.12, 1.0), (0.08, 0.08, 0.08), scenery.METAL)

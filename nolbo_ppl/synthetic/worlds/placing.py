@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import make_pose
-from nolbo_ppl.synthetic.assets.shape_library import Item, ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import ShapeAsset, ShapePool
 from nolbo_ppl.synthetic.renderer.materials import Material, sample_materials
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
 from nolbo_ppl.synthetic.worlds.camera_path import Track
@@ -25,7 +25,7 @@ GAP = 0.04
 class Look:
     """A shape with its colours: look-alikes share it."""
 
-    item: Item
+    item: ShapeAsset
     seed: int
     """Of its materials and textures."""
 

@@ -38,9 +38,7 @@ def facade_material(rng: np.random.Generator) -> Material:
     return Material(hsv(0.09, rng.uniform(0.05, 0.2), 0.7), 0.02, pattern="slabs", contrast=0.3, frequency=1.6)
 
 
-def _window(
-    builder: StaticBuilder, wall: Frame, x: float, z: float, size: tuple[float, float], glass: Material
-) -> None:
+def _window(builder: StaticBuilder, wall: Frame, x: float, z: float, size: tuple[float, float], glass: Material) -> None:
     """A window on the plane y = 0 of a frame whose outside is -y: sill and frame, glass, a bar."""
     (width, height), rim = size, 0.08
     x0, x1, z0, z1 = x - width / 2, x + width / 2, z, z + height
@@ -105,8 +103,12 @@ def house(
     material = facade_material(rng)
     height = 3.2 * storeys + (0.6 if shop else 0.2)
     look = {"pitch": rng.uniform(1.9, 2.8), "window": (rng.uniform(0.9, 1.3), rng.uniform(1.2, 1.6))}
-    roof = Material(hsv(rng.choice([0.02, 0.05, 0.6]), rng.uniform(0.1, 0.6), rng.uniform(0.3, 0.55)),
-                    pattern="brick", contrast=0.3, frequency=2.0)  # fmt: skip
+    roof = Material(
+        hsv(rng.choice([0.02, 0.05, 0.6]), rng.uniform(0.1, 0.6), rng.uniform(0.3, 0.55)),
+        pattern="brick",
+        contrast=0.3,
+        frequency=2.0,
+    )
     builder.box(front, (-width / 2, 0, 0), (width / 2, depth, height), material, roof)
     builder.box(front, (-width / 2 - 0.05, -0.06, 0), (width / 2 + 0.05, 0, 0.45), CONCRETE)
     side_left = Frame(front(-width / 2, depth / 2), front.heading - np.pi / 2, front.origin[2])
@@ -131,10 +133,18 @@ def house(
 
 
 def poster(
-    builder: StaticBuilder, wall: Frame, x: float, z: float, width: float, height: float, rng: np.random.Generator,
-    y: float = -0.03, rim: Material | None = None,
-) -> None:  # fmt: skip
+    builder: StaticBuilder,
+    wall: Frame,
+    x: float,
+    z: float,
+    width: float,
+    height: float,
+    rng: np.random.Generator,
+    y: float = -0.03,
+    rim: Material | None = None,
+) -> None:
     """A picture on the plane y of a wall: a rim, a ground, a few coloured rectangles and triangles."""
+
     def at(u: float, v: float, lift: float) -> np.ndarray:
         return wall(x + (u - 0.5) * width, y - lift, z + v * height)
 
@@ -158,8 +168,13 @@ def poster(
 def tree(builder: StaticBuilder, place: np.ndarray, height: float, rng: np.random.Generator) -> None:
     """A trunk with a crown of a few balls, or a conifer."""
     frame = Frame(place, rng.uniform(-np.pi, np.pi))
-    green = Material(hsv(rng.uniform(0.2, 0.36), rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.6)), 0.02,
-                     pattern="leaves", contrast=0.75, frequency=2.0)  # fmt: skip
+    green = Material(
+        hsv(rng.uniform(0.2, 0.36), rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.6)),
+        0.02,
+        pattern="leaves",
+        contrast=0.75,
+        frequency=2.0,
+    )
     if rng.random() < 0.2:
         builder.solid("cylinder", frame, (0, 0, 0.1 * height), (0.3, 0.3, 0.2 * height), BARK)
         for k in range(3):
@@ -219,9 +234,7 @@ def sign_post(builder: StaticBuilder, place: np.ndarray, heading: float, rng: np
         builder.polygon(np.array([frame(-lift, radius * np.cos(a), height + radius * np.sin(a)) for a in angle]), material)
 
 
-def litter(
-    builder: StaticBuilder, place: np.ndarray, size: float, rng: np.random.Generator, z: float = 0.0
-) -> None:
+def litter(builder: StaticBuilder, place: np.ndarray, size: float, rng: np.random.Generator, z: float = 0.0) -> None:
     """A random piece of clutter of a given box diagonal standing on the ground."""
     parts, box = sample_clutter(rng)
     frame = Frame(place, rng.uniform(-np.pi, np.pi))

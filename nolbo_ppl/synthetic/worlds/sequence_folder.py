@@ -78,11 +78,16 @@ def describe_object(world: World, number: int) -> dict[str, Any]:
     shape = thing.look.item.shape
     T_world_object = world.T_world_ground @ thing.T_ground_object
     return {
-        "id": thing.id, "category": shape.category, "instance": shape.instance, "symmetry": shape.symmetry,
+        "id": thing.id,
+        "category": shape.category,
+        "instance": shape.instance,
+        "symmetry": shape.symmetry,
         "T_world_object": [[round(v, 9) for v in row] for row in T_world_object.tolist()],
-        "diagonal": round(shape.diagonal, 9), "dimensions": [round(v, 9) for v in shape.dimensions.tolist()],
-        "moving": thing.moving is not None, "look": thing.look.seed,
-    }  # fmt: skip
+        "diagonal": round(shape.diagonal, 9),
+        "dimensions": [round(v, 9) for v in shape.dimensions.tolist()],
+        "moving": thing.moving is not None,
+        "look": thing.look.seed,
+    }
 
 
 def _plain(config: DriveConfig) -> dict[str, Any]:
@@ -107,9 +112,11 @@ def write_drive(config: DriveConfig, out: str | os.PathLike[str], workers: int =
         stored = read_json(known)
         if not isinstance(stored, dict) or {key: stored.get(key) for key in made} != made:
             raise input_error(
-                "the folder holds another drive", got=out, expected="a new folder, or the same options to resume",
+                "the folder holds another drive",
+                got=out,
+                expected="a new folder, or the same options to resume",
                 do="choose another --out or delete it",
-            )  # fmt: skip
+            )
     elif out.is_dir() and any(out.iterdir()):
         raise input_error("the folder is not empty", got=out, expected="a new folder", do="choose another --out")
     if not (out / SCENES).is_file():
@@ -161,10 +168,14 @@ def _summary(out: Path) -> DriveSummary:
     facts, objects = read_json(out / DRIVE), read_json(out / OBJECTS)
     rows = [row for _, row in read_jsonl(out / SCENES)]
     return DriveSummary(
-        out=out, frames=len(rows), objects=len(objects), seen=len({o["id"] for row in rows for o in row["objects"]}),
-        instances=len({thing["instance"] for thing in objects}), labels=sum(len(row["objects"]) for row in rows),
+        out=out,
+        frames=len(rows),
+        objects=len(objects),
+        seen=len({o["id"] for row in rows for o in row["objects"]}),
+        instances=len({thing["instance"] for thing in objects}),
+        labels=sum(len(row["objects"]) for row in rows),
         metres=facts["drive_metres"],
-    )  # fmt: skip
+    )
 
 
 def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:

@@ -47,7 +47,7 @@ class DriveFrame:
 
 
 @dataclass(frozen=True)
-class Drive:
+class SequenceFolder:
     """A drive folder."""
 
     path: Path
@@ -107,16 +107,22 @@ def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
             raise input_error(where + "dimensions, diagonal", got=got, expected="metres", file=path)
         found.append(
             DriveObject(
-                row["id"], row["category"], str(row.get("instance", "")), int(row.get("symmetry", 1)), T,
-                float(diagonal), dimensions, bool(row.get("moving", False)),
+                row["id"],
+                row["category"],
+                str(row.get("instance", "")),
+                int(row.get("symmetry", 1)),
+                T,
+                float(diagonal),
+                dimensions,
+                bool(row.get("moving", False)),
             )
-        )  # fmt: skip
+        )
     if len({thing.id for thing in found}) != len(found):
         raise input_error("true objects", got="two with one id", expected="each id once", file=path)
     return tuple(found)
 
 
-def read_drive(path: str | os.PathLike[str]) -> Drive:
+def read_drive(path: str | os.PathLike[str]) -> SequenceFolder:
     """Read a drive folder; images are read when asked for.
 
     Raises:
@@ -125,9 +131,11 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
     path = Path(path)
     if not (path / SCENES).is_file() or not (path / DRIVE).is_file():
         raise input_error(
-            "not a complete drive", got=path, expected=f"a folder with {DRIVE} and {SCENES}",
+            "not a complete drive",
+            got=path,
+            expected=f"a folder with {DRIVE} and {SCENES}",
             do="write it with nolbo drive --out, which also resumes a drive that was stopped",
-        )  # fmt: skip
+        )
     camera = read_json(path / INTRINSICS)
     try:
         intrinsics = np.array([float(camera[name]) for name in ("fx", "fy", "cx", "cy")])
@@ -147,7 +155,7 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
         raise input_error(
             "lengths differ", got=f"{len(frames)} frames, {len(poses)} poses, {len(times)} times", expected="equal", file=path
         )
-    return Drive(path, intrinsics, size, poses, times, objects, frames, read_json(path / DRIVE))
+    return SequenceFolder(path, intrinsics, size, poses, times, objects, frames, read_json(path / DRIVE))
 
 
 def _frames(path: Path, size: tuple[int, int], known: set[str]) -> list[DriveFrame]:

@@ -149,9 +149,15 @@ def _lots(builder: StaticBuilder, street: Street, placer: Placer, rng: np.random
 
 
 def _yard(
-    builder: StaticBuilder, street: Street, placer: Placer, s: float, width: float, room: float, kind: str,
+    builder: StaticBuilder,
+    street: Street,
+    placer: Placer,
+    s: float,
+    width: float,
+    room: float,
+    kind: str,
     rng: np.random.Generator,
-) -> list[Group]:  # fmt: skip
+) -> list[Group]:
     """An open lot: its ground, what closes it at the back, and the objects that stand in it."""
     facade = street.kerb[1] + WALK
     ground = {"garden": GRASS, "boat": GRAVEL, "train": GRAVEL}.get(kind, YARD_CONCRETE)
@@ -175,9 +181,12 @@ def _yard(
     def stand(category: str, x: float, y: float, facing: float, longest: float = np.inf) -> Group:
         def group() -> None:
             placer.place(
-                category, frame(x, y)[:2], frame.heading + facing + rng.normal(0, 0.05), floor=PAVEMENT,
+                category,
+                frame(x, y)[:2],
+                frame.heading + facing + rng.normal(0, 0.05),
+                floor=PAVEMENT,
                 longest=SIZES.get(category, longest),
-            )  # fmt: skip
+            )
 
         return group
 
@@ -187,8 +196,10 @@ def _yard(
     elif kind == "bus":
         groups += [stand("bus", x, 8.0, rng.choice([-1, -1, 1]) * np.pi / 2) for x in np.arange(-half + 1, half, 4.4)]
     elif kind == "boat":
-        groups += [stand("boat", x, 5.5 + 1.5 * rng.random(), rng.uniform(-0.4, 0.4) - np.pi / 2)
-                   for x in np.arange(-half + 1, half, 4.6)]  # fmt: skip
+        groups += [
+            stand("boat", x, 5.5 + 1.5 * rng.random(), rng.uniform(-0.4, 0.4) - np.pi / 2)
+            for x in np.arange(-half + 1, half, 4.6)
+        ]
     elif kind == "aeroplane":
         groups.append(stand("aeroplane", 0.0, 7.5, rng.choice([-1, 1]) * rng.uniform(0.3, 2.8)))
         groups += [stand("motorbike", x, 1.5, rng.uniform(-3, 3)) for x in (-half, half)]

@@ -66,9 +66,7 @@ def lay_ground(builder: StaticBuilder, street: Street, rng: np.random.Generator)
         low, high = street.line(s, kerb, 0.0), street.line(s, kerb, PAVEMENT)
         builder.ribbon(low, high, scenery.KERB, closed=True)
         builder.ribbon(high, street.line(s, kerb + 0.3 * side, PAVEMENT), scenery.KERB, closed=True)
-    builder.ribbon(
-        street.line(s, outer + 0.3, PAVEMENT), street.line(s, outer + WALK, PAVEMENT), PAVING, closed=True
-    )
+    builder.ribbon(street.line(s, outer + 0.3, PAVEMENT), street.line(s, outer + WALK, PAVEMENT), PAVING, closed=True)
     island = loop.inset(-inner + 0.25)
     if len(island) > 2:
         builder.polygon(np.column_stack((island, np.full(len(island), PAVEMENT - 0.004))), PAVING)
@@ -89,9 +87,7 @@ def paint_markings(builder: StaticBuilder, street: Street, rng: np.random.Genera
     for s in np.arange(0, loop.length - 4, 6.0):
         along = np.linspace(s, s + 2.6, 4)
         middle = left * LANE / 2
-        builder.ribbon(
-            street.line(along, middle - 0.07, 0.006), street.line(along, middle + 0.07, 0.006), scenery.MARK
-        )
+        builder.ribbon(street.line(along, middle - 0.07, 0.006), street.line(along, middle + 0.07, 0.006), scenery.MARK)
         for offset in (street.kerb[1] - 2.4, 2.4 - street.kerb[-1]):
             frame = street.frame(s, offset, 0.006)
             builder.quad(frame(-0.05, 0), frame(0.05, 0), frame(0.05, 2.3), frame(-0.05, 2.3), scenery.MARK)
@@ -102,8 +98,10 @@ def paint_markings(builder: StaticBuilder, street: Street, rng: np.random.Genera
         for lateral in np.arange(-street.kerb[-1] + 0.5, street.kerb[1] - 0.7, 1.0):
             frame = Frame(street.at(s, lateral)[0], street.at(s, lateral)[1], 0.007)
             builder.quad(frame(0, -0.25), frame(3, -0.25), frame(3, 0.25), frame(0, 0.25), scenery.MARK)
-    greys = [Material(hsv(rng.choice([0.1, 0.6]), 0.06, v), 0.02, pattern="grain", contrast=0.35, frequency=f)
-             for v, f in zip((0.30, 0.36, 0.52, 0.58, 0.26), (3.0, 2.0, 4.0, 3.0, 6.0))]  # fmt: skip
+    greys = [
+        Material(hsv(rng.choice([0.1, 0.6]), 0.06, v), 0.02, pattern="grain", contrast=0.35, frequency=f)
+        for v, f in zip((0.30, 0.36, 0.52, 0.58, 0.26), (3.0, 2.0, 4.0, 3.0, 6.0))
+    ]
     bright = [Material(hsv(rng.random(), s, v)) for s, v in ((0.1, 0.95), (0.8, 0.7), (0.7, 0.5), (0.1, 0.15), (0.5, 0.4))]
     for kind, count, z in ((0, 0.35, 0.002), (1, 0.3, 0.004), (2, 1.6, 0.012)):
         for _ in range(int(count * loop.length)):

@@ -92,9 +92,7 @@ def make_world(config: DriveConfig) -> World:
     Raises:
         InputError: no object of those wanted has room (the loop is too short).
     """
-    path_rng, light_rng, place_rng, look_rng, move_rng = (
-        np.random.default_rng([config.seed, 9100 + k]) for k in range(5)
-    )
+    path_rng, light_rng, place_rng, look_rng, move_rng = (np.random.default_rng([config.seed, 9100 + k]) for k in range(5))
     street = config.world == "street"
     loop = random_loop(
         config.perimeter, 9.0 if street else 1.9, path_rng, (1.15, 1.7) if street else (1.3, 1.9), 0.12 if street else 0.0
@@ -109,13 +107,17 @@ def make_world(config: DriveConfig) -> World:
     static, materials = build(loop, placer, config.clutter, place_rng).built()
     objects = [*placer.objects, *_moving(config, loop, catalogue, len(placer.objects), move_rng)]
     return World(
-        config, loop, poses, tuple(objects), static, materials, *_light(config, light_rng),
-    )  # fmt: skip
+        config,
+        loop,
+        poses,
+        tuple(objects),
+        static,
+        materials,
+        *_light(config, light_rng),
+    )
 
 
-def _moving(
-    config: DriveConfig, loop: Loop, catalogue: Catalogue, first: int, rng: np.random.Generator
-) -> list[WorldObject]:
+def _moving(config: DriveConfig, loop: Loop, catalogue: Catalogue, first: int, rng: np.random.Generator) -> list[WorldObject]:
     """Vehicles in the opposite lane, spread over the loop, all at one speed so that they never meet."""
     made = []
     lateral, speed = LANE, -config.step * rng.uniform(0.5, 0.9)
@@ -129,9 +131,7 @@ def _moving(
     return made
 
 
-def _light(
-    config: DriveConfig, rng: np.random.Generator
-) -> tuple[tuple[Light, ...], np.ndarray, np.ndarray, Backdrop, float]:
+def _light(config: DriveConfig, rng: np.random.Generator) -> tuple[tuple[Light, ...], np.ndarray, np.ndarray, Backdrop, float]:
     """Sun and sky, or the lamps of a room: fixed in the ground frame."""
     street = config.world == "street"
     ranges = SceneConfig(sun_elevation=(42.0, 62.0) if street else (68.0, 82.0), tint=0.05, second_light_probability=0.0)
@@ -144,8 +144,12 @@ def _light(
     if not street:
         zenith = horizon = np.array(hsv(0.1, 0.03, 0.85))
     backdrop = Backdrop(
-        zenith, horizon, Surface(np.full((2, 3), 0.2)), clouds=rng.uniform(0.3, 0.8) if street else 0.0,
-        seed=int(rng.integers(2**31)), mesh_haze=1 / 150 if street else 0.0,
-    )  # fmt: skip
+        zenith,
+        horizon,
+        Surface(np.full((2, 3), 0.2)),
+        clouds=rng.uniform(0.3, 0.8) if street else 0.0,
+        seed=int(rng.integers(2**31)),
+        mesh_haze=1 / 150 if street else 0.0,
+    )
     only = (replace(lights[0], colour=colour * strength),)
     return only, sky, sky * (0.5 if street else 0.65), backdrop, 0.95 if street else 1.05

@@ -80,19 +80,24 @@ class DriveConfig:
             raise input_error("share of look-alikes", got=self.look_alikes, expected="0 to below 1")
         if not 0.3 <= self.camera_height <= 2.5 or not -20 <= self.tilt <= 45:
             raise input_error(
-                "camera of the drive", got=f"height {self.camera_height} m, tilt {self.tilt} degrees",
+                "camera of the drive",
+                got=f"height {self.camera_height} m, tilt {self.tilt} degrees",
                 expected="height of 0.3 to 2.5 m, tilt of -20 to 45 degrees",
-            )  # fmt: skip
+            )
         if self.perimeter < LEAST_LOOP[self.world]:
             raise input_error(
-                "loop of the drive", got=f"{self.perimeter:.1f} m (step x frames / laps)",
-                expected=f"at least {LEAST_LOOP[self.world]:g} m", do="use more frames, a longer step or fewer laps",
-            )  # fmt: skip
+                "loop of the drive",
+                got=f"{self.perimeter:.1f} m (step x frames / laps)",
+                expected=f"at least {LEAST_LOOP[self.world]:g} m",
+                do="use more frames, a longer step or fewer laps",
+            )
         if self.moving and (self.world != "street" or self.opposite > 0):
             raise input_error(
-                "moving objects", got=f"{self.moving} in world {self.world!r} with opposite {self.opposite}",
-                expected="world street without an opposite leg: they drive in the opposite lane", do="use moving 0",
-            )  # fmt: skip
+                "moving objects",
+                got=f"{self.moving} in world {self.world!r} with opposite {self.opposite}",
+                expected="world street without an opposite leg: they drive in the opposite lane",
+                do="use moving 0",
+            )
 
     @property
     def perimeter(self) -> float:

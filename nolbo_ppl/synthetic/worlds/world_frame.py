@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import inverse
 from nolbo_ppl.synthetic.renderer.antialias import shade_smoothly
-from nolbo_ppl.synthetic.renderer.camera_view import Light, Placed, View
+from nolbo_ppl.synthetic.renderer.camera_view import Light, MeshInstance, View
 from nolbo_ppl.synthetic.renderer.ray_casting import to_display, trace
 from nolbo_ppl.synthetic.scenes.render_scene import ObjectLabel, Rendered, amodal_box
 from nolbo_ppl.synthetic.scenes.scene_records import record_of
@@ -55,7 +55,7 @@ def frame_view(world: World, frame: int) -> tuple[View, tuple[WorldObject, ...]]
     config, T_ground_camera = world.config, world.T_ground_camera[frame]
     T_camera_ground = inverse(T_ground_camera)
     R, t = T_camera_ground[:3, :3], T_camera_ground[:3, 3]
-    placed = [Placed(world.static, R, t, world.static_materials, -1, config.seed & 0xFFFF, config.world == "street")]
+    placed = [MeshInstance(world.static, R, t, world.static_materials, -1, config.seed & 0xFFFF, config.world == "street")]
     shown: list[WorldObject] = []
     for thing in world.objects:
         diagonal = thing.look.item.shape.diagonal
@@ -66,15 +66,23 @@ def frame_view(world: World, frame: int) -> tuple[View, tuple[WorldObject, ...]]
         if not _reach(centre, 0.5 * SHADOW_REACH * diagonal, world.intrinsics, config.size):
             continue
         linear = R @ pose[:3, :3] * diagonal
-        placed.append(Placed(thing.look.item.mesh, linear, centre, thing.look.materials, len(shown), thing.look.seed))
+        placed.append(MeshInstance(thing.look.item.mesh, linear, centre, thing.look.materials, len(shown), thing.look.seed))
         shown.append(thing)
     lights = tuple(Light(R @ light.direction, light.colour, light.shadow) for light in world.lights)
     width, height = config.size
     view = View(
-        height=height, width=width, intrinsics=world.intrinsics, up=R[:, 2], north=R[:, 1],
-        camera_height=float(T_ground_camera[2, 3]), placed=tuple(placed), lights=lights, ambient_sky=world.ambient_sky,
-        ambient_ground=world.ambient_ground, backdrop=replace(world.backdrop, R_sky_camera=R.T),
-    )  # fmt: skip
+        height=height,
+        width=width,
+        intrinsics=world.intrinsics,
+        up=R[:, 2],
+        north=R[:, 1],
+        camera_height=float(T_ground_camera[2, 3]),
+        placed=tuple(placed),
+        lights=lights,
+        ambient_sky=world.ambient_sky,
+        ambient_ground=world.ambient_ground,
+        backdrop=replace(world.backdrop, R_sky_camera=R.T),
+    )
     return view, tuple(shown)
 
 
@@ -108,10 +116,17 @@ def render_frame(world: World, frame: int) -> RenderedFrame:
     return RenderedFrame(Rendered(image, world.intrinsics, tuple(labels), owner), tuple(ids))
 
 
-def _label(thing: WorldObject, placed: Placed, box: Float[np.ndarray, " 4"], visibility: float) -> ObjectLabel:
+def _label(thing: WorldObject, placed: MeshInstance, box: Float[np.ndarray, " 4"], visibility: float) -> ObjectLabel:
     item = thing.look.item
     return ObjectLabel(
-        category=item.shape.category, instance=item.shape.instance, box=box,
-        R_camera_object=placed.linear / item.shape.diagonal, position=placed.offset, size=item.shape.diagonal,
-        dimensions=item.shape.dimensions, visibility=min(1.0, visibility), symmetry=item.shape.symmetry, item=item,
-    )  # fmt: skip
+        category=item.shape.category,
+        instance=item.shape.instance,
+        box=box,
+        R_camera_object=placed.linear / item.shape.diagonal,
+        position=placed.offset,
+        size=item.shape.diagonal,
+        dimensions=item.shape.dimensions,
+        visibility=min(1.0, visibility),
+        symmetry=item.shape.symmetry,
+        item=item,
+    )

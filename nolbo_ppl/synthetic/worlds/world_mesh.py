@@ -57,9 +57,7 @@ class StaticBuilder:
         """Add a flat quadrilateral."""
         self.polygon(np.array([a, b, c, d]), material)
 
-    def panel(
-        self, wall: Frame, low: tuple[float, float], high: tuple[float, float], material: Material, y: float = 0.0
-    ) -> None:
+    def panel(self, wall: Frame, low: tuple[float, float], high: tuple[float, float], material: Material, y: float = 0.0) -> None:
         """Add an upright rectangle between two corners (x, z) on the plane y of a local frame."""
         (x0, z0), (x1, z1) = low, high
         self.quad(wall(x0, y, z0), wall(x1, y, z0), wall(x1, y, z1), wall(x0, y, z1), material)
@@ -74,9 +72,7 @@ class StaticBuilder:
         faces = np.concatenate((np.stack((i, n + i, n + j), axis=1), np.stack((i, n + j, j), axis=1)))
         self.add(np.concatenate((left, right)), faces, material)
 
-    def box(
-        self, frame: Frame, low: Vector, high: Vector, material: Material, top: Material | None = None
-    ) -> None:
+    def box(self, frame: Frame, low: Vector, high: Vector, material: Material, top: Material | None = None) -> None:
         """Add an upright box between two corners of a local frame; no underside when it stands on the ground."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]

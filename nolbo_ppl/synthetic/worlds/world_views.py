@@ -70,8 +70,14 @@ def _world(kind: str, seed: int, objects: int) -> World:
     indoor = kind == "indoor"
     step, height = (0.25, 1.5) if indoor else (0.9, 1.65)
     config = DriveConfig(
-        world="indoor" if indoor else "street", seed=seed, frames=120, laps=1.0, step=step, objects=objects,
-        clutter=objects // 2, camera_height=height,
+        world="indoor" if indoor else "street",
+        seed=seed,
+        frames=120,
+        laps=1.0,
+        step=step,
+        objects=objects,
+        clutter=objects // 2,
+        camera_height=height,
     )
     return make_world(config)
 
@@ -108,10 +114,14 @@ class ViewSource:
         config = self.config
         low, high = np.log(config.focal)
         camera = replace(
-            world.config, size=(config.size, config.size), focal=float(np.exp(rng.uniform(low, high))),
-            least_visibility=config.least_visibility, least_box=config.least_box, noise=float(rng.uniform(0, 0.02)),
+            world.config,
+            size=(config.size, config.size),
+            focal=float(np.exp(rng.uniform(low, high))),
+            least_visibility=config.least_visibility,
+            least_box=config.least_box,
+            noise=float(rng.uniform(0, 0.02)),
             seed=int(rng.integers(2**31)),
-        )  # fmt: skip
+        )
         exposure = world.exposure * float(np.exp(rng.uniform(-0.25, 0.25)))
         seen = replace(world, config=camera, T_ground_camera=self._pose(world, rng)[None], exposure=exposure)
         return render_frame(seen, 0).rendered

@@ -54,9 +54,7 @@ def test_poles_are_seen_where_they_are(tmp_path: Path) -> None:
         assert name is not None
         np.testing.assert_allclose(point, expected[name], atol=1e-4)
     again = convert_kitti_poles(tmp_path, "00", seed=1)
-    np.testing.assert_array_equal(
-        again.observations.position, convert_kitti_poles(tmp_path, "00", seed=1).observations.position
-    )
+    np.testing.assert_array_equal(again.observations.position, convert_kitti_poles(tmp_path, "00", seed=1).observations.position)
 
 
 def test_poles_noise_misses_and_clutter_are_as_stated(tmp_path: Path) -> None:
@@ -138,9 +136,7 @@ def test_real_files_convert_and_read_back(data_dir: Path, tmp_path: Path) -> Non
     parked = [o for o in data.T_world_object if sum(x == o for x in data.objects) > 20]
     assert len(parked) > 10
     spread = [
-        np.median(
-            np.abs(world[[x == o for x in data.objects]] - np.median(world[[x == o for x in data.objects]], axis=0))
-        )
+        np.median(np.abs(world[[x == o for x in data.objects]] - np.median(world[[x == o for x in data.objects]], axis=0)))
         for o in parked
     ]
     assert np.median(spread) < 0.15

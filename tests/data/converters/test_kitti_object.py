@@ -21,7 +21,7 @@ from nolbo_ppl.data.converters.kitti_object import (
     read_calibration,
     read_object_labels,
     scene_box,
-)  # fmt: skip
+)
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes
@@ -158,8 +158,9 @@ def test_real_boxes_project_onto_each_other(data_dir: Path, tmp_path: Path) -> N
         camera = read_calibration(data / "calib" / f"{Path(name).stem}.txt") if own else CAMERAS[source.split(",")[0]]
         off += [
             np.abs(projected_box(label, camera) - label.box - 0.5).max()
-            for label in labels if label.kind == "Car" and label.truncated == 0
-        ]  # fmt: skip
+            for label in labels
+            if label.kind == "Car" and label.truncated == 0
+        ]
     assert np.median(off) < 1.5 and np.max(off) < 5.0
 
 

@@ -16,7 +16,7 @@ from nolbo_ppl.inference.elbo import (
     BOUND_TERMS,
     INCLUSIVE,
     PURE_BOUND,
-    SceneElbo,
+    SceneELBO,
 )
 from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.observation_model import Nolbo
@@ -44,7 +44,7 @@ def test_sum_of_terms_is_the_loss(form: str, missing: bool) -> None:
     with torch.no_grad():
         scene = model.guide.observe(batch)
         torch.manual_seed(0)
-        result = SceneElbo(PURE_BOUND).evaluate(model.story, model.guide, scene, scenes=2)
+        result = SceneELBO(PURE_BOUND).evaluate(model.story, model.guide, scene, scenes=2)
     assert set(result.terms) == set(BOUND_TERMS) - (set() if missing else {"label_kl", "instance_label_kl"})
     total = sum(float(value) for value in result.terms.values())
     assert total == pytest.approx(-2 * float(result.loss), abs=1e-12 * abs(total))
@@ -58,7 +58,7 @@ def test_weights_multiply_their_terms() -> None:
     with torch.no_grad():
         scene = model.guide.observe(batch)
     weights = {"shape_inclusive": 0.25, "box": 2.0, "orientation_inclusive": 3.0, "objectness": 0.0}
-    result = SceneElbo(weights).evaluate(model.story, model.guide, scene, scenes=2, decode=0)
+    result = SceneELBO(weights).evaluate(model.story, model.guide, scene, scenes=2, decode=0)
     assert set(result.terms) == {"shape_inclusive", "box", "orientation_inclusive"}
     total = sum(weights[name] * float(value) for name, value in result.terms.items())
     assert float(result.loss) == pytest.approx(-total / 2, rel=1e-13)
@@ -147,7 +147,7 @@ def test_the_azimuth_of_a_free_axis_is_ignored(form: str, weights: dict[str, flo
     for turn in (0.0, 1.1):
         scene = observed_scene(config, batch, dataclasses.replace(q, azimuth_natural=q.azimuth_natural.requires_grad_()))
         scene.batch.viewpoint[..., 0] += turn
-        result = SceneElbo(weights).evaluate(model.story, model.guide, scene, decode=0)
+        result = SceneELBO(weights).evaluate(model.story, model.guide, scene, decode=0)
         (gradient,) = torch.autograd.grad(result.loss, q.azimuth_natural, allow_unused=True)
         assert gradient is None or bool((gradient.abs() < 1e-12).all())
         found.append(result.terms)

@@ -15,7 +15,7 @@ from nolbo_ppl.inference.elbo import (
     INCLUSIVE,
     PAPER,
     PURE_BOUND,
-    SceneElbo,
+    SceneELBO,
     SceneLoss,
 )
 from tests.bound_cases import FORMS
@@ -41,7 +41,7 @@ def test_gradients_against_finite_differences(form: str, objective: str) -> None
     batch = random_batch(config, scenes=1, slots=3, objects=3, seed=2)
     batch.category[0, 0] = batch.instance[0, 0] = -1
     weights = {**PURE_BOUND, "voxels": 0.01} if objective == "elbo" else {**INCLUSIVE, "instance_inclusive": 1.0}
-    loss = SceneLoss(model.story, model.guide, SceneElbo(weights))
+    loss = SceneLoss(model.story, model.guide, SceneELBO(weights))
 
     def value() -> Tensor:
         torch.manual_seed(3)
@@ -56,8 +56,14 @@ def test_gradients_against_finite_differences(form: str, objective: str) -> None
             continue
         part = name.split(".")[:3] if name.startswith("guide") else name.split(".")[:2]
         parts.setdefault(".".join(part), []).append(parameter)
-    expected = {"guide.encoder.stem", "guide.encoder.middle", "guide.encoder.deep", "guide.head.objectness",
-                "guide.head.outputs", "story.prior"} | ({"story.decoder"} if objective == "elbo" else set())  # fmt: skip
+    expected = {
+        "guide.encoder.stem",
+        "guide.encoder.middle",
+        "guide.encoder.deep",
+        "guide.head.objectness",
+        "guide.head.outputs",
+        "story.prior",
+    } | ({"story.decoder"} if objective == "elbo" else set())
     assert expected == set(parts)
     for part, parameters in parts.items():
         direction = [torch.randn(p.shape, generator=generator) for p in parameters]
@@ -76,12 +82,15 @@ def test_gradients_against_finite_differences(form: str, objective: str) -> None
 
 @pytest.mark.parametrize(
     ("weights", "message"),
-    [({"boxes": 1.0}, "unknown term of the bound: got .*boxes.*box_kl"), ({"box": math.nan}, "weight of box"),
-     ({"box": math.inf}, "weight of box.*finite")],
-)  # fmt: skip
+    [
+        ({"boxes": 1.0}, "unknown term of the bound: got .*boxes.*box_kl"),
+        ({"box": math.nan}, "weight of box"),
+        ({"box": math.inf}, "weight of box.*finite"),
+    ],
+)
 def test_bad_weights(weights: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        SceneElbo(weights)
+        SceneELBO(weights)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +104,7 @@ def test_disagreeing_sites(hide_in: str, message: str) -> None:
     hidden: Callable[..., None] = poutine.block(model.guide if hide_in == "guide" else model.story, hide=["box_latent"])
     story, guide = (model.story, hidden) if hide_in == "guide" else (hidden, model.guide)
     with pytest.raises(NolboError, match=message):
-        SceneElbo().terms(story, guide, scene)
+        SceneELBO().terms(story, guide, scene)
 
 
 def test_paper_weights_turn_the_objectness_round() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from nolbo_ppl.inference import elbo as module
 from nolbo_ppl.inference.elbo import (
     ElboResult,
-    SceneElbo,
+    SceneELBO,
 )
 from tests.bound_cases import terms_of, unsymmetric
 from tests.factories import (
@@ -108,7 +108,7 @@ def test_inclusive_optimum_is_the_exact_posterior() -> None:
             box_loc=free.loc,
             box_scale=free.log_box.exp(),
         )
-        elbo = SceneElbo({"orientation_inclusive": 1.0, "box_inclusive": 1.0})
+        elbo = SceneELBO({"orientation_inclusive": 1.0, "box_inclusive": 1.0})
         return elbo.evaluate(model.story, model.guide, dataclasses.replace(scene, posterior=posterior), decode=0)
 
     optimiser = torch.optim.LBFGS(

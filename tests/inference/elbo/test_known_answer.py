@@ -12,7 +12,7 @@ from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import (
     PURE_BOUND,
     ElboResult,
-    SceneElbo,
+    SceneELBO,
 )
 from nolbo_ppl.models.generative import conjugate_truth, expected_normal_log_prob
 from tests.factories import (
@@ -67,7 +67,7 @@ def test_svi_reaches_the_exact_posterior(closed_form: bool, steps: int, toleranc
     matrix, shift, scale = torch.randn(3, 2, generator=generator), torch.tensor([0.5, -1.0, 0.2]), 0.7
     y = torch.randn(30, 3, generator=generator) * 1.5
     story, guide = LinearStory(y, matrix, shift, scale, closed_form), LinearGuide()
-    elbo = SceneElbo(PURE_BOUND)
+    elbo = SceneELBO(PURE_BOUND)
 
     def loss() -> ElboResult:
         return elbo.evaluate(story, guide, y, scenes=len(y))

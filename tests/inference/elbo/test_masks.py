@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nolbo_ppl.inference.elbo import (
-    SceneElbo,
+    SceneELBO,
     SceneLoss,
 )
 from nolbo_ppl.models.scene_batch import SceneBatch
@@ -42,8 +42,11 @@ def test_an_empty_scene_changes_no_objects_terms() -> None:
     batch.category[0, 0] = -1
     alone = terms_of(model, model.guide.observe(batch[:1]), set(EVERYTHING))
     empty = random_batch(config, scenes=2, slots=3, objects=0, seed=9)
-    fields = {f.name: torch.cat((getattr(batch, f.name)[:1], getattr(empty, f.name)[:1]))
-              for f in dataclasses.fields(SceneBatch) if getattr(batch, f.name) is not None}  # fmt: skip
+    fields = {
+        f.name: torch.cat((getattr(batch, f.name)[:1], getattr(empty, f.name)[:1]))
+        for f in dataclasses.fields(SceneBatch)
+        if getattr(batch, f.name) is not None
+    }
     both = terms_of(model, model.guide.observe(batch.replace(**fields)), set(EVERYTHING))
     just_empty = terms_of(model, model.guide.observe(empty[:1]), set(EVERYTHING))
     assert set(alone) == set(both)
@@ -61,8 +64,11 @@ def test_permuting_object_slots_changes_nothing() -> None:
     batch.has_voxels[1, 2] = False
     before = terms_of(model, model.guide.observe(batch), set(EVERYTHING))
     order = torch.tensor([2, 3, 0, 1])
-    per_slot = {f.name: getattr(batch, f.name)[:, order] for f in dataclasses.fields(SceneBatch)
-                if f.name not in ("image", "intrinsics") and getattr(batch, f.name) is not None}  # fmt: skip
+    per_slot = {
+        f.name: getattr(batch, f.name)[:, order]
+        for f in dataclasses.fields(SceneBatch)
+        if f.name not in ("image", "intrinsics") and getattr(batch, f.name) is not None
+    }
     after = terms_of(model, model.guide.observe(batch.replace(**per_slot)), set(EVERYTHING))
     assert set(before) == set(after)
     for name in before:
@@ -84,8 +90,10 @@ def test_permuting_regions_changes_nothing() -> None:
 
 def corrupted(batch: SceneBatch, value: float) -> SceneBatch:
     """Other values wherever the masks say that there is nothing to see."""
-    out = dataclasses.replace(batch, **{f.name: getattr(batch, f.name).clone() for f in dataclasses.fields(SceneBatch)
-                                        if getattr(batch, f.name) is not None})  # fmt: skip
+    out = dataclasses.replace(
+        batch,
+        **{f.name: getattr(batch, f.name).clone() for f in dataclasses.fields(SceneBatch) if getattr(batch, f.name) is not None},
+    )
     out.viewpoint[~batch.has_viewpoint] = value
     out.position[~batch.has_position] = value
     out.diagonal[~batch.has_size] = value
@@ -118,7 +126,7 @@ def test_values_under_the_masks_do_not_matter(value: float, form: str) -> None:
     for one in (batch, corrupted(batch, value)):
         model = tiny_model(config, scatter=0.1)
         torch.manual_seed(2)
-        result = SceneLoss(model.story, model.guide, SceneElbo(EVERYTHING))(one, decode=None)
+        result = SceneLoss(model.story, model.guide, SceneELBO(EVERYTHING))(one, decode=None)
         result.loss.backward()
         gradient = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
         assert all(bool(torch.isfinite(g).all()) for g in gradient.values())
@@ -135,11 +143,12 @@ def test_masked_labels_give_no_gradient() -> None:
     """What is missing has a term of exactly zero and pulls at nothing."""
     config = tiny_config()
     batch = random_batch(config, seed=1)
-    batch = batch.replace(**{name: torch.zeros_like(batch.present) for name in
-                             ("has_viewpoint", "has_position", "has_size", "has_voxels")})  # fmt: skip
+    batch = batch.replace(
+        **{name: torch.zeros_like(batch.present) for name in ("has_viewpoint", "has_position", "has_size", "has_voxels")}
+    )
     scene = observed_scene(config, batch)
     posterior = scene.posterior.map(lambda value: value.requires_grad_())
-    result = SceneElbo(EVERYTHING).evaluate(
+    result = SceneELBO(EVERYTHING).evaluate(
         tiny_model(config).story, tiny_model(config).guide, dataclasses.replace(scene, posterior=posterior)
     )
     for name in ("orientation_kl", "rotation", "range_kl", "range", "orientation_inclusive", "range_inclusive"):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nolbo_ppl.inference.elbo import (
     PURE_BOUND,
-    SceneElbo,
+    SceneELBO,
     SceneLoss,
 )
 from tests.bound_cases import terms_of
@@ -118,7 +118,7 @@ def test_gradients_with_missing_instances_are_finite() -> None:
     batch = random_batch(config, seed=4)
     batch.category[0, 0] = -1
     batch.instance[:] = -1
-    result = SceneLoss(model.story, model.guide, SceneElbo(PURE_BOUND))(batch, decode=None)
+    result = SceneLoss(model.story, model.guide, SceneELBO(PURE_BOUND))(batch, decode=None)
     result.loss.backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is None or bool(torch.isfinite(parameter.grad).all()), name

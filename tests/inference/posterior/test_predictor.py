@@ -22,7 +22,7 @@ from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import cell_of, decode_box, decode_range
-from nolbo_ppl.structures.object_posteriors import Observations, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 from tests.factories import instance_config, tiny_model
 
 CAMERA = [70.0, 74.0, 33.0, 29.0]
@@ -43,10 +43,10 @@ def picture(seed: int = 0, height: int = 64, width: int = 64) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def assert_same(a: Observations, b: Observations, tolerance: float = 1e-9) -> None:
+def assert_same(a: ObjectPosteriors, b: ObjectPosteriors, tolerance: float = 1e-9) -> None:
     """Equal in every field."""
     assert len(a) == len(b)
-    for field in dataclasses.fields(Observations):
+    for field in dataclasses.fields(ObjectPosteriors):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if isinstance(x, ViewpointModes):
             for part in dataclasses.fields(x):
@@ -74,12 +74,25 @@ def test_detections_and_their_shapes() -> None:
     expected = torch.sigmoid(logit[logit > 0]).sort(descending=True).values
     np.testing.assert_allclose(found.objectness, expected.numpy())
     shapes = {
-        "box": (n, 4), "box_scale": (n, 4), "class_log_posterior": (n, 4), "class_log_likelihood": (n, 4),
-        "latent": (n, 4), "latent_scale": (n, 4), "position": (n, 3), "position_covariance": (n, 3, 3),
-        "elevation_inplane": (n, 2), "elevation_inplane_scale": (n, 2), "viewpoint": (n, 3),
-        "R_camera_object": (n, 3, 3), "rotation_scale": (n,), "diagonal": (n,), "diagonal_log_scale": (n,),
-        "size": (n, 3), "voxel_mean": (n, 32, 32, 32), "voxel_variance": (n, 32, 32, 32),
-    }  # fmt: skip
+        "box": (n, 4),
+        "box_scale": (n, 4),
+        "class_log_posterior": (n, 4),
+        "class_log_likelihood": (n, 4),
+        "latent": (n, 4),
+        "latent_scale": (n, 4),
+        "position": (n, 3),
+        "position_covariance": (n, 3, 3),
+        "elevation_inplane": (n, 2),
+        "elevation_inplane_scale": (n, 2),
+        "viewpoint": (n, 3),
+        "R_camera_object": (n, 3, 3),
+        "rotation_scale": (n,),
+        "diagonal": (n,),
+        "diagonal_log_scale": (n,),
+        "size": (n, 3),
+        "voxel_mean": (n, 32, 32, 32),
+        "voxel_variance": (n, 32, 32, 32),
+    }
     for name, shape in shapes.items():
         value = getattr(found, name)
         assert value.shape == shape, name
@@ -97,9 +110,7 @@ def test_overlapping_regions_add_up() -> None:
         logit = model.model.guide.encode(torch.from_numpy(image).permute(2, 0, 1)[None]).objectness_logit[0]
     region = (torch.sigmoid(logit) > 0.02).nonzero()[:, 0]
     p = torch.sigmoid(logit[region])
-    box = torch.cat(
-        [decode_box(parameters(model, image, int(r)).box_loc, r[None] // 2, 4, model.config) for r in region]
-    )
+    box = torch.cat([decode_box(parameters(model, image, int(r)).box_loc, r[None] // 2, 4, model.config) for r in region])
     iou = pairwise_iou(box, box)
     left, expected = set(range(len(region))), []
     while left:
@@ -110,9 +121,7 @@ def test_overlapping_regions_add_up() -> None:
     expected = sorted((e for e in expected if e[0] > 0.6), reverse=True)
     assert len(expected) < len(region), "some are joined"
     np.testing.assert_allclose(found.objectness, [value for value, _ in expected], atol=1e-12)
-    np.testing.assert_allclose(
-        np.sort(found.box, axis=0), np.sort(box[[best for _, best in expected]].numpy(), axis=0)
-    )
+    np.testing.assert_allclose(np.sort(found.box, axis=0), np.sort(box[[best for _, best in expected]].numpy(), axis=0))
 
 
 def test_size_of_the_scaled_images() -> None:
@@ -123,9 +132,7 @@ def test_size_of_the_scaled_images() -> None:
     image = picture(2, 50, 110)
     assert_same(model.observe(image, CAMERA, size=96, threshold=0.4), larger.observe(image, CAMERA, threshold=0.4))
     boxes = [np.array([[5.0, 4, 60, 40]])]
-    assert_same(
-        model.observe_boxes([image], CAMERA, boxes, size=96)[0], larger.observe_boxes([image], CAMERA, boxes)[0]
-    )
+    assert_same(model.observe_boxes([image], CAMERA, boxes, size=96)[0], larger.observe_boxes([image], CAMERA, boxes)[0])
     with pytest.raises(InputError, match="multiple of 32"):
         model.observe(image, CAMERA, size=100)
 

@@ -27,8 +27,9 @@ def test_variance_of_correlated_views_is_that_of_their_mean(correlation: float) 
     common, own = rng.normal(size=(draws, 1, 2)), rng.normal(size=(draws, views, 2))
     latent = scale * (np.sqrt(correlation) * common + np.sqrt(1 - correlation) * own)
     group = np.repeat(np.arange(draws), views)
-    mean, variance = weighted_latents(latent.reshape(-1, 2), np.full((draws * views, 2), scale**2), group,
-                                      np.ones(draws * views), draws)  # fmt: skip
+    mean, variance = weighted_latents(
+        latent.reshape(-1, 2), np.full((draws * views, 2), scale**2), group, np.ones(draws * views), draws
+    )
     said = correlated_variance(variance, np.full(draws, float(views)), correlation)
     measured = mean.var(axis=0)
     error = measured * np.sqrt(2 / draws)
@@ -47,8 +48,9 @@ def test_the_online_system_widens_latents_of_views_that_are_alike() -> None:
     closer.add(track)
     closer.add(replace(track, rows=[0], latent_variance=scale[0] ** 2))
     features = closer._features(np.arange(2), np.array([True, False]))
-    batch = weighted_latents(np.repeat(table_latent, views, 0), np.repeat(scale**2, views, 0), np.zeros(views, int),
-                             np.ones(views), 1)[1]  # fmt: skip
+    batch = weighted_latents(
+        np.repeat(table_latent, views, 0), np.repeat(scale**2, views, 0), np.zeros(views, int), np.ones(views), 1
+    )[1]
     expected = correlated_variance(batch, np.array([float(views)]), 0.6)[0]
     np.testing.assert_allclose(features.latent_variance, [expected, scale[0] ** 2])
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.geometry.pose import make_pose, rotation_angle, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
-from nolbo_ppl.inference.slam.graph import Estimate, add_observation_factors, resolve_observations, to_values
+from nolbo_ppl.inference.slam.graph import SlamEstimate, add_observation_factors, resolve_observations, to_values
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.orientation import (
-    RotationModes,
+    OrientationModes,
     mixture_log_density,
     observed_modes,
     resolve_modes,
@@ -27,21 +27,27 @@ CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.0
 Z = np.array([0.0, 0.0, 1.0])
 
 
-def random_modes(rng: np.random.Generator, n: int, count: int) -> RotationModes:
+def random_modes(rng: np.random.Generator, n: int, count: int) -> OrientationModes:
     weight = rng.dirichlet(np.ones(count), n)
     weight[0, 1:] = 0.0  # a row with one mode alone
     with np.errstate(divide="ignore"):
-        return RotationModes(np.log(weight / weight.sum(axis=1, keepdims=True)),
-                             so3_exp(rng.standard_normal((n, count, 3))), 0.2 + rng.random((n, count)))
+        return OrientationModes(
+            np.log(weight / weight.sum(axis=1, keepdims=True)),
+            so3_exp(rng.standard_normal((n, count, 3))),
+            0.2 + rng.random((n, count)),
+        )
 
 
-def brute_parts(predicted: np.ndarray, modes: RotationModes, row: int, order: int) -> list[tuple[float, np.ndarray]]:
+def brute_parts(predicted: np.ndarray, modes: OrientationModes, row: int, order: int) -> list[tuple[float, np.ndarray]]:
     """Every (density, rotation) of the mixture, the uniform part last; rotation vectors by scipy."""
     parts = []
     for k in range(modes.log_weight.shape[1]):
         weight, R, s = np.exp(modes.log_weight[row, k]), modes.R[row, k], modes.scale[row, k]
-        flips = [(g, (1 - CONFIG.flip_probability) / order) for g in range(order)] if order % 2 else [
-            (g, 1 / order) for g in range(order)]
+        flips = (
+            [(g, (1 - CONFIG.flip_probability) / order) for g in range(order)]
+            if order % 2
+            else [(g, 1 / order) for g in range(order)]
+        )
         turns = [(2 * np.pi * g / order, share) for g, share in flips]
         if order % 2:
             turns += [(2 * np.pi * g / order + np.pi, CONFIG.flip_probability / order) for g in range(order)]
@@ -81,37 +87,41 @@ def test_a_free_axis_ignores_the_azimuth() -> None:
     predicted = so3_exp(rng.standard_normal((4, 3)))
     free = np.zeros(4, dtype=int)
     value = mixture_log_density(predicted, modes, free, CONFIG)
-    turned = RotationModes(modes.log_weight, modes.R @ so3_exp(rng.uniform(-3, 3, (4, 2, 1)) * Z), modes.scale)
+    turned = OrientationModes(modes.log_weight, modes.R @ so3_exp(rng.uniform(-3, 3, (4, 2, 1)) * Z), modes.scale)
     np.testing.assert_allclose(mixture_log_density(predicted, turned, free, CONFIG), value, atol=1e-9)
 
 
 def test_a_sure_mode_stands_alone_and_padding_says_nothing() -> None:
     R = np.stack([np.eye(3), so3_exp(1.5 * Z)])[None]
     with np.errstate(divide="ignore"):
-        modes = RotationModes(np.log([[1.0, 0.0]]), R, np.full((1, 2), 0.1))
+        modes = OrientationModes(np.log([[1.0, 0.0]]), R, np.full((1, 2), 0.1))
     resolved = resolve_modes(np.eye(3)[None], modes, np.ones(1, int), CONFIG)
     assert len(resolved.row) == 1 and resolved.responsibility[0] == 1.0
-    alone = RotationModes(np.zeros((1, 1)), R[:, :1], np.full((1, 1), 0.1))
-    np.testing.assert_allclose(mixture_log_density(np.eye(3)[None], modes, np.ones(1, int), CONFIG),
-                               mixture_log_density(np.eye(3)[None], alone, np.ones(1, int), CONFIG))
+    alone = OrientationModes(np.zeros((1, 1)), R[:, :1], np.full((1, 1), 0.1))
+    np.testing.assert_allclose(
+        mixture_log_density(np.eye(3)[None], modes, np.ones(1, int), CONFIG),
+        mixture_log_density(np.eye(3)[None], alone, np.ones(1, int), CONFIG),
+    )
 
 
 def test_gradient_of_the_split_factor_is_that_of_the_mixture() -> None:
     """EM's identity: the M-step's quadratic, split by responsibilities, touches minus the log density of the mixture."""
     modes = np.stack([np.eye(3), so3_exp(0.5 * Z)])
-    table = make_table([0], [[0.0, 0.0, 5.0]], position_scale=1.0, mode_weight=[[0.6, 0.4]], mode_rotation=modes[None],
-                       mode_std=[[0.3, 0.3]])
+    table = make_table(
+        [0], [[0.0, 0.0, 5.0]], position_scale=1.0, mode_weight=[[0.6, 0.4]], mode_rotation=modes[None], mode_std=[[0.3, 0.3]]
+    )
     problem = SlamProblem(np.eye(4)[None], table)
     noise = estimate_noise(problem, CONFIG)
     T = make_pose(so3_exp(0.2 * Z), np.array([0.0, 0.0, 5.0]))
-    factors = resolve_observations(problem, noise, CONFIG, Estimate(np.eye(4)[None], T[None]), np.zeros(1, int),
-                                   np.zeros(1, int), np.ones(1))
+    factors = resolve_observations(
+        problem, noise, CONFIG, SlamEstimate(np.eye(4)[None], T[None]), np.zeros(1, int), np.zeros(1, int), np.ones(1)
+    )
     assert len(factors.weight) >= 2 and factors.weight.sum() == pytest.approx(1.0)
 
     def quadratic(angle: float) -> float:
         graph = gtsam.NonlinearFactorGraph()
         add_observation_factors(graph, factors)
-        return graph.error(to_values(Estimate(np.eye(4)[None], make_pose(so3_exp(angle * Z), T[:3, 3])[None])))
+        return graph.error(to_values(SlamEstimate(np.eye(4)[None], make_pose(so3_exp(angle * Z), T[:3, 3])[None])))
 
     def mixture(angle: float) -> float:
         seen = observed_modes(table, noise.rotation_scale)
@@ -123,8 +133,9 @@ def test_gradient_of_the_split_factor_is_that_of_the_mixture() -> None:
 
 
 def test_scales_of_modes_follow_a_correction() -> None:
-    table = make_table([0], [[0, 0, 5.0]], mode_weight=[[0.6, 0.4]], mode_rotation=np.tile(np.eye(3), (1, 2, 1, 1)),
-                       mode_std=[[0.1, 0.2]])
+    table = make_table(
+        [0], [[0, 0, 5.0]], mode_weight=[[0.6, 0.4]], mode_rotation=np.tile(np.eye(3), (1, 2, 1, 1)), mode_std=[[0.1, 0.2]]
+    )
     np.testing.assert_allclose(observed_modes(table, np.array([0.3])).scale, [[0.3, 0.6]])
 
 
@@ -132,8 +143,13 @@ def test_stated_modes_find_orientations_the_best_mode_misses() -> None:
     """A detector whose best mode is a quarter turn off in 45 of 100 detections, and says so."""
     rng = np.random.default_rng(3)
     truth = simulate_circuit(rng, laps=1, frames_per_lap=60)
-    drive = simulate_drive(truth, rng, world=WorldConfig(objects=20, categories=3, latent_dim=4),
-                           odometry_rotation_scale=0.01, detector=DetectorConfig(flip_rate=0.0))
+    drive = simulate_drive(
+        truth,
+        rng,
+        world=WorldConfig(objects=20, categories=3, latent_dim=4),
+        odometry_rotation_scale=0.01,
+        detector=DetectorConfig(flip_rate=0.0),
+    )
     table = drive.observations
     n = len(table)
     quarter = so3_exp(np.pi / 2 * rng.choice([-1.0, 1.0], n)[:, None] * Z)
@@ -143,17 +159,26 @@ def test_stated_modes_find_orientations_the_best_mode_misses() -> None:
     second = np.where(wrong[:, None, None], table.rotation, other)
     weight = np.tile([0.55, 0.45], (n, 1))
     alone = replace(table, rotation=best)
-    modes = replace(alone, mode_weight=weight, mode_rotation=np.stack([best, second], axis=1),
-                    mode_std=np.repeat(table.rotation_scale[:, None], 2, axis=1))
+    modes = replace(
+        alone,
+        mode_weight=weight,
+        mode_rotation=np.stack([best, second], axis=1),
+        mode_std=np.repeat(table.rotation_scale[:, None], 2, axis=1),
+    )
     assert drive.world is not None
     right = []
     for observations in (alone, modes):
         result = solve(SlamProblem(drive.odometry, observations), CONFIG)
         found = result.associations
-        owner = [np.bincount(drive.object_of[found.row[(found.landmark == j) & (found.weight > 0.5)]] + 1).argmax() - 1
-                 for j in range(len(result.landmarks))]
-        error = [rotation_angle(drive.world.rotation[o].T @ result.landmarks[j].T_world_object[:3, :3])
-                 for j, o in enumerate(owner) if o >= 0]
+        owner = [
+            np.bincount(drive.object_of[found.row[(found.landmark == j) & (found.weight > 0.5)]] + 1).argmax() - 1
+            for j in range(len(result.landmarks))
+        ]
+        error = [
+            rotation_angle(drive.world.rotation[o].T @ result.landmarks[j].T_world_object[:3, :3])
+            for j, o in enumerate(owner)
+            if o >= 0
+        ]
         right.append(np.mean(np.array(error) < 0.5))
     assert right[1] > 0.85 and right[1] > right[0] + 0.05, right
 

@@ -22,8 +22,12 @@ def small(seed: int, latent_dim: int = 4, rotation: float | None = 0.05) -> Plai
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=1, frames_per_lap=40)
     drive = simulate_drive(
-        truth, rng, world=WorldConfig(objects=10, categories=2, latent_dim=latent_dim), odometry_rotation_scale=0.004,
-        detector=DetectorConfig(flip_rate=0.2, rotation_scale=rotation, clutter_rate=0.3))
+        truth,
+        rng,
+        world=WorldConfig(objects=10, categories=2, latent_dim=latent_dim),
+        odometry_rotation_scale=0.004,
+        detector=DetectorConfig(flip_rate=0.2, rotation_scale=rotation, clutter_rate=0.3),
+    )
     assert drive.world is not None
     start = drive.world.position + rng.standard_normal(drive.world.position.shape)
     return plain_init(SlamProblem(drive.odometry, drive.observations), CONFIG, make_pose(drive.world.rotation, start))
@@ -45,8 +49,13 @@ def test_the_bound_never_falls_with_stated_modes() -> None:
     wrong = table.rotation @ so3_exp(np.pi / 2 * np.array([0, 0, 1.0]))
     first = rng.random(len(table)) < 0.7
     modes = np.where(first[:, None, None, None], np.stack([table.rotation, wrong], 1), np.stack([wrong, table.rotation], 1))
-    table = replace(table, rotation=modes[:, 0], mode_weight=np.tile([0.6, 0.4], (len(table), 1)), mode_rotation=modes,
-                    mode_std=np.full((len(table), 2), 0.05))
+    table = replace(
+        table,
+        rotation=modes[:, 0],
+        mode_weight=np.tile([0.6, 0.4], (len(table), 1)),
+        mode_rotation=modes,
+        mode_std=np.full((len(table), 2), 0.05),
+    )
     problem = SlamProblem(state.problem.odometry, table)
     start = plain_init(problem, CONFIG, state.estimate.T_world_landmark, noise=state.noise)
     _, infos = plain_solve(start, iterations=8, tolerance=-np.inf)
@@ -70,8 +79,9 @@ def test_error_is_that_of_gtsam() -> None:
 def test_evidence_and_weights_equal_enumeration() -> None:
     """One frame, three detections, two landmarks: the sum over all associations written out."""
     odometry = np.tile(np.eye(4), (2, 1, 1))
-    table = make_table([0, 0, 0], np.array([[0, 0, 5.0], [1, 0, 6.0], [0.5, 0, 5.5]]), position_scale=0.5,
-                       objectness=[0.9, 0.6, 0.3])
+    table = make_table(
+        [0, 0, 0], np.array([[0, 0, 5.0], [1, 0, 6.0], [0.5, 0, 5.5]]), position_scale=0.5, objectness=[0.9, 0.6, 0.3]
+    )
     landmarks = make_pose(np.tile(np.eye(3), (2, 1, 1)), np.array([[0.2, 0, 5.0], [0.9, 0.1, 6.1]]))
     state = plain_init(SlamProblem(odometry, table), CONFIG, landmarks)
     _, weights, evidence = e_step(state)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import DetectorConfig, Drive, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam import (
-    ObjectSlam,
+    IncrementalSlam,
     SlamConfig,
     SlamProblem,
     SlamResult,
@@ -20,14 +20,14 @@ from nolbo_ppl.inference.slam import (
     solve_with_associations,
     step,
 )
-from nolbo_ppl.io.observations import ObservationTable, concatenate, make_table
+from nolbo_ppl.io.observations import Detections, concatenate, make_table
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
 
 
-def drive(seed: int = 0, detector: DetectorConfig | None = None, laps: int = 2, **world: object) -> Drive:
+def drive(seed: int = 0, detector: DetectorConfig | None = None, laps: int = 2, **world: object) -> SimulatedSequence:
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=laps, frames_per_lap=90)
     objects = WorldConfig(**{"objects": 45, "categories": 8, "latent_dim": 6, **world})  # type: ignore[arg-type]
@@ -47,12 +47,12 @@ def ate(T: np.ndarray, truth: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def solved() -> tuple[Drive, SlamResult]:
+def solved() -> tuple[SimulatedSequence, SlamResult]:
     world = drive()
     return world, solve(SlamProblem(world.odometry, world.observations), CONFIG)
 
 
-def test_loops_close_as_with_true_associations(solved: tuple[Drive, SlamResult]) -> None:
+def test_loops_close_as_with_true_associations(solved: tuple[SimulatedSequence, SlamResult]) -> None:
     world, result = solved
     oracle = solve_with_associations(result.state.problem, world.object_of, CONFIG)
     before, after = ate(world.odometry, world.truth), ate(result.T_world_camera, world.truth)
@@ -62,7 +62,7 @@ def test_loops_close_as_with_true_associations(solved: tuple[Drive, SlamResult])
     assert score.precision > 0.99 and score.recall > 0.9
 
 
-def test_associations_are_probabilities(solved: tuple[Drive, SlamResult]) -> None:
+def test_associations_are_probabilities(solved: tuple[SimulatedSequence, SlamResult]) -> None:
     _, result = solved
     found = result.associations
     total = found.new + found.background
@@ -71,7 +71,7 @@ def test_associations_are_probabilities(solved: tuple[Drive, SlamResult]) -> Non
     assert found.exact
 
 
-def test_answers_carry_uncertainty(solved: tuple[Drive, SlamResult]) -> None:
+def test_answers_carry_uncertainty(solved: tuple[SimulatedSequence, SlamResult]) -> None:
     world, result = solved
     covariance = result.pose_covariances(np.array([0, 10, 100]))
     assert np.linalg.eigvalsh(covariance).min() > 0
@@ -88,7 +88,7 @@ def test_answers_carry_uncertainty(solved: tuple[Drive, SlamResult]) -> None:
         result.pose_covariances(np.array([10**6]))
 
 
-def test_covariances_equal_gtsam_marginals(solved: tuple[Drive, SlamResult]) -> None:
+def test_covariances_equal_gtsam_marginals(solved: tuple[SimulatedSequence, SlamResult]) -> None:
     import gtsam
 
     from nolbo_ppl.inference.slam.graph import landmark_key, pose_key, to_values
@@ -97,13 +97,15 @@ def test_covariances_equal_gtsam_marginals(solved: tuple[Drive, SlamResult]) -> 
     _, result = solved
     marginals = gtsam.Marginals(final_graph(result.state), to_values(result.state.estimate))
     for i in (1, 60, 179):
-        np.testing.assert_allclose(result.pose_covariances(np.array([i]))[0], marginals.marginalCovariance(pose_key(i)),
-                                   rtol=1e-4, atol=1e-9)
-    np.testing.assert_allclose(result.landmark_covariances()[3], marginals.marginalCovariance(landmark_key(3)),
-                               rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            result.pose_covariances(np.array([i]))[0], marginals.marginalCovariance(pose_key(i)), rtol=1e-4, atol=1e-9
+        )
+    np.testing.assert_allclose(
+        result.landmark_covariances()[3], marginals.marginalCovariance(landmark_key(3)), rtol=1e-4, atol=1e-9
+    )
 
 
-def test_samples_have_the_marginal_covariance(solved: tuple[Drive, SlamResult]) -> None:
+def test_samples_have_the_marginal_covariance(solved: tuple[SimulatedSequence, SlamResult]) -> None:
     _, result = solved
     poses, _ = result.linearisation.samples(4000, np.random.default_rng(0))
     exact = result.pose_covariances(np.array([90]))[0]
@@ -138,8 +140,11 @@ def test_position_only_landmarks_close_loops() -> None:
 
 def test_too_small_scales_are_reported() -> None:
     world = drive(seed=2)
-    table = replace(world.observations, latent_scale=world.observations.latent_scale / 3,
-                    position_covariance=world.observations.position_covariance / 9)
+    table = replace(
+        world.observations,
+        latent_scale=world.observations.latent_scale / 3,
+        position_covariance=world.observations.position_covariance / 9,
+    )
     state = init(SlamProblem(world.odometry, table), CONFIG)
     assert any("latent" in w for w in state.noise.warnings)
     assert any("position" in w for w in state.noise.warnings)
@@ -149,8 +154,12 @@ def test_too_small_scales_are_reported() -> None:
 def test_scales_are_estimated_where_none_are_stated() -> None:
     world = drive(seed=6, laps=1)
     unknown = np.full(len(world.observations), np.nan)
-    table = replace(world.observations, position_covariance=unknown[:, None, None] * np.eye(3), rotation_scale=unknown,
-                    latent_scale=unknown[:, None] * np.ones(6))
+    table = replace(
+        world.observations,
+        position_covariance=unknown[:, None, None] * np.eye(3),
+        rotation_scale=unknown,
+        latent_scale=unknown[:, None] * np.ones(6),
+    )
     noise = init(SlamProblem(world.odometry, table), CONFIG).noise
     assert 0.5 < np.median(noise.latent_scale) / 0.7 < 1.5
     assert 0.5 < np.median(noise.rotation_scale) / 0.05 < 2.5
@@ -183,7 +192,7 @@ def test_moving_objects_do_not_bend_the_trajectory() -> None:
     assert ate(result.T_world_camera, world.truth) < 1.2 * ate(clean.T_world_camera, world.truth) + 0.05
 
 
-def empty_table() -> ObservationTable:
+def empty_table() -> Detections:
     return make_table(np.zeros(0, int), np.zeros((0, 3)))
 
 
@@ -194,9 +203,7 @@ def test_poor_input_gives_an_answer(case: str) -> None:
     if case == "no observations":
         table = empty_table()
     elif case == "one landmark":
-        table = table.select(
-            world.object_of[: len(table)] == world.object_of[np.argmax(world.object_of[: len(table)] >= 0)]
-        )
+        table = table.select(world.object_of[: len(table)] == world.object_of[np.argmax(world.object_of[: len(table)] >= 0)])
     elif case == "one frame":
         odometry, table = odometry[:1], table.select(table.frame == 0)
     elif case == "one observation":
@@ -225,9 +232,9 @@ def test_malformed_problems_raise() -> None:
 
 
 @pytest.mark.slow
-def test_online_ends_where_batch_does(solved: tuple[Drive, SlamResult]) -> None:
+def test_online_ends_where_batch_does(solved: tuple[SimulatedSequence, SlamResult]) -> None:
     world, batch = solved
-    slam = ObjectSlam(CONFIG, calibration=SlamProblem(world.odometry, world.observations))
+    slam = IncrementalSlam(CONFIG, calibration=SlamProblem(world.odometry, world.observations))
     closings = 0
     for t, pose in enumerate(world.odometry):
         closings += slam.update(pose, world.observations.select(world.observations.frame == t)).closings
@@ -238,7 +245,7 @@ def test_online_ends_where_batch_does(solved: tuple[Drive, SlamResult]) -> None:
 
 
 def test_online_refuses_nonsense() -> None:
-    slam = ObjectSlam(CONFIG)
+    slam = IncrementalSlam(CONFIG)
     with pytest.raises(InputError, match="no keyframe"):
         slam.finish()
     with pytest.raises(InputError, match="no pose"):

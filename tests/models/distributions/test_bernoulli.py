@@ -45,9 +45,7 @@ def test_kls_match_high_precision(is_object, eps) -> None:
 def test_kl_of_two_guides_matches_torch_where_torch_is_finite() -> None:
     a, b = LOGITS[2:-2].repeat(6), LOGITS[2:-2].repeat_interleave(6)
     expected = kl_divergence(Bernoulli(logits=a), Bernoulli(logits=b))
-    torch.testing.assert_close(
-        kl_divergence(Objectness(logits=a), Objectness(logits=b)), expected, rtol=1e-6, atol=1e-9
-    )
+    torch.testing.assert_close(kl_divergence(Objectness(logits=a), Objectness(logits=b)), expected, rtol=1e-6, atol=1e-9)
     assert Objectness(logits=a).expand((2, 36)).batch_shape == (2, 36)
 
 

@@ -39,9 +39,7 @@ def test_densities_match_torch() -> None:
 def test_kl_to_each_component_matches_torch_and_monte_carlo(assert_mean) -> None:
     loc, scale = posterior()
     kl = kl_to_each_component(loc, scale, COMPONENTS)
-    reference = kl_divergence(Normal(loc[..., None, :], scale[..., None, :]), Normal(COMPONENTS, torch.ones(6, 4))).sum(
-        -1
-    )
+    reference = kl_divergence(Normal(loc[..., None, :], scale[..., None, :]), Normal(COMPONENTS, torch.ones(6, 4))).sum(-1)
     torch.testing.assert_close(kl, reference)
     q = Normal(loc, scale)
     z = q.sample((5000,))

@@ -114,9 +114,7 @@ def test_kl_by_integration_over_so3_and_monte_carlo(so3_grid, random_rotations, 
     modes = random_rotations(2)
     p, q = MatrixFisher(modes[0], torch.tensor(3.0)), MatrixFisher(modes[1], torch.tensor(1.2))
     log_p, log_q = p.log_prob(grid), q.log_prob(grid)
-    torch.testing.assert_close(
-        kl_divergence(p, q), (weight * log_p.exp() * (log_p - log_q)).sum(), rtol=1e-9, atol=1e-9
-    )
+    torch.testing.assert_close(kl_divergence(p, q), (weight * log_p.exp() * (log_p - log_q)).sum(), rtol=1e-9, atol=1e-9)
     near = MatrixFisher(modes[0], torch.tensor(400.0))
     far = MatrixFisher(MatrixFisher(modes[0], torch.tensor(300.0)).sample(), torch.tensor(250.0))
     R = near.sample((20_000,))

@@ -35,9 +35,7 @@ MAKE = {
     "MatrixFisher": lambda: MatrixFisher(rotation(), 20.0),
     "SymmetricMatrixFisher": lambda: SymmetricMatrixFisher(rotation(), 20.0, torch.tensor([0, 2])),
     "ViewpointNormal": lambda: ViewpointNormal(torch.randn(*BATCH, 3), torch.tensor(0.1)),
-    "ViewpointNormalSymmetric": lambda: ViewpointNormal(
-        torch.randn(3), torch.tensor(0.1), torch.ones(BATCH, dtype=int)
-    ),
+    "ViewpointNormalSymmetric": lambda: ViewpointNormal(torch.randn(3), torch.tensor(0.1), torch.ones(BATCH, dtype=int)),
     "ViewpointMixture": lambda: ViewpointMixture(
         torch.randn(*BATCH, 4), torch.randn(*BATCH, 4, 2), torch.randn(2), torch.full((2,), 0.2)
     ),

@@ -83,9 +83,7 @@ def test_expected_log_prob_is_tight_for_a_certain_orientation(random_rotations) 
 
 
 def test_expected_log_prob_is_differentiable_where_nothing_is_known_about_the_azimuth() -> None:
-    mean = (
-        ViewpointNormal(torch.zeros(1, 3), torch.tensor(0.1), order=torch.tensor([0])).mean_rotation().requires_grad_()
-    )
+    mean = ViewpointNormal(torch.zeros(1, 3), torch.tensor(0.1), order=torch.tensor([0])).mean_rotation().requires_grad_()
     bound = SymmetricMatrixFisher(torch.eye(3), 10.0, ORDERS).expected_log_prob(mean)
     (grad,) = torch.autograd.grad(bound.sum(), mean)
     assert bool(torch.isfinite(bound).all()) and bool(torch.isfinite(grad).all())

@@ -47,9 +47,7 @@ def test_normal_density_mean_rotation_and_entropy_by_quadrature(order) -> None:
     order = None if order is None else torch.tensor(order)
     p = ViewpointNormal(torch.tensor([0.4, 0.3, -0.2]), torch.tensor([0.5, 0.4, 0.4]), order=order)
     density = lambda v: p.log_prob(v).exp()  # noqa: E731
-    torch.testing.assert_close(
-        mean_over_grid(density, lambda v: torch.ones(len(v))), torch.tensor(1.0), atol=1e-9, rtol=0
-    )
+    torch.testing.assert_close(mean_over_grid(density, lambda v: torch.ones(len(v))), torch.tensor(1.0), atol=1e-9, rtol=0)
     torch.testing.assert_close(mean_over_grid(density, viewpoint_to_matrix), p.mean_rotation(), atol=1e-9, rtol=0)
     torch.testing.assert_close(mean_over_grid(density, lambda v: -p.log_prob(v)), p.entropy(), atol=1e-7, rtol=0)
 
@@ -58,9 +56,7 @@ def test_mixture_density_mean_rotation_and_entropy_by_quadrature() -> None:
     natural = torch.tensor([[3.0, 4.0], [-6.0, 1.0], [0.0, 0.0]])
     q = ViewpointMixture(torch.tensor([0.1, 0.5, -0.3]), natural, torch.tensor([0.3, -0.2]), torch.tensor([0.35, 0.4]))
     density = lambda v: q.log_prob(v).exp()  # noqa: E731
-    torch.testing.assert_close(
-        mean_over_grid(density, lambda v: torch.ones(len(v))), torch.tensor(1.0), atol=1e-9, rtol=0
-    )
+    torch.testing.assert_close(mean_over_grid(density, lambda v: torch.ones(len(v))), torch.tensor(1.0), atol=1e-9, rtol=0)
     torch.testing.assert_close(mean_over_grid(density, viewpoint_to_matrix), q.mean_rotation(), atol=1e-9, rtol=0)
     torch.testing.assert_close(mean_over_grid(density, lambda v: -q.log_prob(v)), q.entropy(), atol=1e-8, rtol=0)
 
@@ -149,18 +145,14 @@ def test_kl_of_two_normals_and_its_symmetry(assert_mean) -> None:
         torch.where((j < count)[:, None], torch.nn.functional.pad((2 * math.pi * j / count)[:, None], (0, 2)), math.nan)
         for j in range(3)
     ]
-    log_q = [
-        q.angles.log_prob((v + t + math.pi) % (2 * math.pi) - math.pi).sum(-1).nan_to_num(-math.inf) for t in turns
-    ]
+    log_q = [q.angles.log_prob((v + t + math.pi) % (2 * math.pi) - math.pi).sum(-1).nan_to_num(-math.inf) for t in turns]
     folded = torch.logsumexp(torch.stack(log_q), 0)
     inclusive = kl_divergence(p, q)
     log_p = p.log_prob(v) + count.log()
     assert_mean((log_p - folded)[:, [0, 1, 3]], inclusive[[0, 1, 3]], extra=1e-6)
     # A free axis: elevation and in-plane rotation only.
     for result, (a, b) in ((exclusive, (q, p)), (inclusive, (p, q))):
-        rest = kl_divergence(
-            WrappedNormal(a.loc[2, 1:], a.scale[2, 1:]), WrappedNormal(b.loc[2, 1:], b.scale[2, 1:])
-        ).sum()
+        rest = kl_divergence(WrappedNormal(a.loc[2, 1:], a.scale[2, 1:]), WrappedNormal(b.loc[2, 1:], b.scale[2, 1:])).sum()
         torch.testing.assert_close(result[2], rest)
     plain = kl_divergence(ViewpointNormal(p.loc, p.scale), q)
     torch.testing.assert_close(plain[0], inclusive[0])
@@ -221,9 +213,7 @@ def test_gradients() -> None:
 
 def test_single_precision() -> None:
     q, p = guide(40), story(40, order=ORDERS.repeat(10))
-    q32 = ViewpointMixture(
-        *(x.float() for x in (q.logits, q.natural, q.elevation_inplane_loc, q.elevation_inplane_scale))
-    )
+    q32 = ViewpointMixture(*(x.float() for x in (q.logits, q.natural, q.elevation_inplane_loc, q.elevation_inplane_scale)))
     p32 = ViewpointNormal(p.loc.float(), p.scale.float(), order=p.order)
     torch.testing.assert_close(kl_divergence(p32, q32).double(), kl_divergence(p, q), rtol=2e-4, atol=2e-4)
     torch.testing.assert_close(kl_divergence(q32, p32).double(), kl_divergence(q, p), rtol=2e-4, atol=2e-3)

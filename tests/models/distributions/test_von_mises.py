@@ -25,9 +25,7 @@ def test_log_prob_matches_scipy() -> None:
     x = np.linspace(-np.pi, np.pi, 301)
     weights = torch.softmax(LOGITS, -1).numpy()
     expected = np.log(sum(w * stats.vonmises.pdf(x, k, m) for w, k, m in zip(weights, KAPPA.numpy(), MEAN.numpy())))
-    torch.testing.assert_close(
-        mixture().log_prob(torch.as_tensor(x)), torch.as_tensor(expected), rtol=1e-11, atol=1e-11
-    )
+    torch.testing.assert_close(mixture().log_prob(torch.as_tensor(x)), torch.as_tensor(expected), rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("kappa", [0.0, 1e-12, 0.3, 20.0, 300.0, 1e4])
@@ -161,9 +159,7 @@ def test_single_precision_agrees_with_double() -> None:
     double = mixture(1e4, kappa)
     single = VonMisesMixture(LOGITS.float(), double.natural.float(), 1e4)
     # One half ulp of the angle itself is 1.2e-7 rad, on a slope of 1e4 per rad 1e-3 nats.
-    torch.testing.assert_close(
-        single.log_prob(x.float()).double(), double.log_prob(x.float().double()), rtol=1e-5, atol=3e-3
-    )
+    torch.testing.assert_close(single.log_prob(x.float()).double(), double.log_prob(x.float().double()), rtol=1e-5, atol=3e-3)
     for name in ("circular_std", "mean"):
         torch.testing.assert_close(getattr(single, name).double(), getattr(double, name), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(single.mean_direction().double(), double.mean_direction(), rtol=1e-6, atol=1e-6)
@@ -201,9 +197,6 @@ def test_concentration_is_limited_and_can_come_back() -> None:
     (grad,) = torch.autograd.grad(q.log_prob(torch.tensor(mean + 0.1)), natural)
     step = 1e-3
     turned = [
-        VonMisesMixture(torch.zeros(1), natural + s * across, 50.0).log_prob(torch.tensor(mean + 0.1))
-        for s in (step, -step)
+        VonMisesMixture(torch.zeros(1), natural + s * across, 50.0).log_prob(torch.tensor(mean + 0.1)) for s in (step, -step)
     ]
-    torch.testing.assert_close(
-        (grad * across).sum(), (turned[0] - turned[1]).detach() / (2 * step), rtol=1e-6, atol=1e-9
-    )
+    torch.testing.assert_close((grad * across).sum(), (turned[0] - turned[1]).detach() / (2 * step), rtol=1e-6, atol=1e-9)

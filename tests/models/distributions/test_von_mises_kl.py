@@ -17,9 +17,7 @@ from nolbo_ppl.models.distributions import (
 )
 
 
-def random_mixture(
-    batch: int, seed: int, largest: float = 300.0, dtype: torch.dtype = torch.float64
-) -> VonMisesMixture:
+def random_mixture(batch: int, seed: int, largest: float = 300.0, dtype: torch.dtype = torch.float64) -> VonMisesMixture:
     generator = torch.Generator().manual_seed(seed)
     logits = torch.randn(batch, 4, generator=generator, dtype=torch.float64)
     mean = 2 * math.pi * torch.rand(batch, 4, generator=generator, dtype=torch.float64)
@@ -67,9 +65,7 @@ def test_inclusive_kl_matches_dense_quadrature(order, scale) -> None:
 def test_inclusive_kl_at_the_crossing_of_two_narrow_components() -> None:
     """The worst case: the mean of p on the kink between two components of kappa 300, at many separations."""
     half = torch.linspace(0.05, 3.0, 25) / 2
-    q = VonMisesMixture.from_mean_concentration(
-        torch.zeros(25, 2), torch.stack((-half, half), -1), torch.tensor([300.0, 300.0])
-    )
+    q = VonMisesMixture.from_mean_concentration(torch.zeros(25, 2), torch.stack((-half, half), -1), torch.tensor([300.0, 300.0]))
     p = WrappedNormal(torch.zeros(25), torch.full((25,), 0.05))
     exact = dense_inclusive(p, q, 1, 50_000)
     torch.testing.assert_close(kl_divergence(p, q), exact, rtol=1e-10, atol=1e-10)
@@ -114,9 +110,7 @@ def scipy_exclusive(q: VonMisesMixture, p: WrappedNormal, i: int, order: int) ->
     kinks = [period * (k + 0.5) for k in range(-order, order)]
     modes = [(m - loc + math.pi) % (2 * math.pi) - math.pi for m in mean]
     points = sorted({-math.pi, math.pi, *(x for x in kinks + modes if -math.pi < x < math.pi)})
-    return sum(
-        integrate.quad(integrand, a, b, epsabs=1e-11, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(points)
-    )
+    return sum(integrate.quad(integrand, a, b, epsabs=1e-11, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(points))
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
@@ -141,9 +135,7 @@ def test_exclusive_kl_of_mixed_orders_and_its_bound(circle) -> None:
         one = kl_mixture_to_wrapped(q, p, n)[i]
         torch.testing.assert_close(result[i], one)
         turns = [2 * math.pi * j / n for j in range(n)]
-        log_p = torch.logsumexp(
-            torch.stack([p.log_prob((x + t + math.pi) % (2 * math.pi) - math.pi) for t in turns]), 0
-        )
+        log_p = torch.logsumexp(torch.stack([p.log_prob((x + t + math.pi) % (2 * math.pi) - math.pi) for t in turns]), 0)
         log_q = q.log_prob(x)
         exact = ((log_q.exp() * (log_q - log_p + math.log(n))).sum(0) * (2 * math.pi / len(x)))[i]
         # The tangent form is the exact divergence but for the neglected modes, which only lower it.

@@ -78,9 +78,7 @@ def test_rsample_gradient_is_that_of_the_moments(assert_mean) -> None:
     loc, scale = (x.expand(count).clone().requires_grad_() for x in parameters)
     torch.sin(WrappedNormal(loc, scale).rsample()).sum().backward()
     v, s = parameters.clone().requires_grad_().unbind()
-    closed = torch.autograd.functional.jacobian(
-        lambda v, s: wrapped_normal_moments(v, s).mean[0], (v.detach(), s.detach())
-    )
+    closed = torch.autograd.functional.jacobian(lambda v, s: wrapped_normal_moments(v, s).mean[0], (v.detach(), s.detach()))
     assert_mean(torch.stack((loc.grad, scale.grad), -1), torch.stack(closed))
 
 

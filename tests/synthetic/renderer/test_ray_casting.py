@@ -9,7 +9,7 @@ import pytest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.synthetic.renderer import textures
-from nolbo_ppl.synthetic.renderer.camera_view import Backdrop, Light, Mesh, Placed, Surface, View
+from nolbo_ppl.synthetic.renderer.camera_view import Backdrop, Light, Mesh, MeshInstance, Surface, View
 from nolbo_ppl.synthetic.renderer.materials import PATTERNS, Material, material_table, sample_material
 from nolbo_ppl.synthetic.renderer.ray_casting import average_down, pixel_directions, shade, shadowed, to_display, trace
 from nolbo_ppl.synthetic.scenes.distractors import KINDS, sample_clutter, unit_mesh
@@ -25,25 +25,32 @@ def rotation(rng: np.random.Generator) -> np.ndarray:
     return q * np.sign(np.linalg.det(q))
 
 
-def placed(kind: str, linear: np.ndarray, offset: np.ndarray, owner: int = -1, material: Material = GREY) -> Placed:
+def placed(kind: str, linear: np.ndarray, offset: np.ndarray, owner: int = -1, material: Material = GREY) -> MeshInstance:
     vertices, faces = unit_mesh(kind)
     mesh = Mesh(vertices, faces, np.zeros(len(faces), dtype=np.int64))
-    return Placed(mesh, linear, np.asarray(offset), (material,), owner)
+    return MeshInstance(mesh, linear, np.asarray(offset), (material,), owner)
 
 
-def make_view(things: list[Placed], lights: tuple[Light, ...] = (), size: int = 32, **backdrop) -> View:
+def make_view(things: list[MeshInstance], lights: tuple[Light, ...] = (), size: int = 32, **backdrop) -> View:
     """A camera one unit above the ground, tilted down by 30 degrees."""
     tilt = np.radians(30)
     up = np.array([0.0, -np.cos(tilt), -np.sin(tilt)])
     return View(
-        height=size, width=size, intrinsics=np.array([1.1 * size, 1.2 * size, size / 2 + 1.3, size / 2 - 0.7]), up=up,
-        north=np.array([1.0, 0.0, 0.0]), camera_height=1.0, placed=tuple(things), lights=lights,
-        ambient_sky=np.full(3, 0.5), ambient_ground=np.full(3, 0.2),
+        height=size,
+        width=size,
+        intrinsics=np.array([1.1 * size, 1.2 * size, size / 2 + 1.3, size / 2 - 0.7]),
+        up=up,
+        north=np.array([1.0, 0.0, 0.0]),
+        camera_height=1.0,
+        placed=tuple(things),
+        lights=lights,
+        ambient_sky=np.full(3, 0.5),
+        ambient_ground=np.full(3, 0.2),
         backdrop=Backdrop(np.array([0.2, 0.4, 0.8]), np.full(3, 0.7), Surface(FLAT), **backdrop),
-    )  # fmt: skip
+    )
 
 
-def brute_force(things: list[Placed], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def brute_force(things: list[MeshInstance], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Thing and distance of the first hit of each ray, by Moeller and Trumbore over every triangle."""
     best, index = np.full(len(directions), np.inf), np.full(len(directions), -1)
     for k, thing in enumerate(things):
@@ -64,7 +71,7 @@ def brute_force(things: list[Placed], origins: np.ndarray, directions: np.ndarra
 
 
 @pytest.fixture(scope="module")
-def crowd() -> list[Placed]:
+def crowd() -> list[MeshInstance]:
     rng = np.random.default_rng(5)
     things = []
     for k in range(5):
@@ -74,7 +81,7 @@ def crowd() -> list[Placed]:
     return things
 
 
-def test_trace_agrees_with_brute_force(crowd: list[Placed]) -> None:
+def test_trace_agrees_with_brute_force(crowd: list[MeshInstance]) -> None:
     view = make_view(crowd)
     hits = trace(view)
     rays = pixel_directions(0, 0, 32, 32, view.intrinsics).astype(np.float64)
@@ -92,7 +99,7 @@ def test_trace_agrees_with_brute_force(crowd: list[Placed]) -> None:
         assert hits.owner_visible[k] == pytest.approx((index == k).sum(), abs=3)
 
 
-def test_shadows_agree_with_brute_force(crowd: list[Placed]) -> None:
+def test_shadows_agree_with_brute_force(crowd: list[MeshInstance]) -> None:
     view = make_view(crowd)
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.5, -0.5, 1.5], [1.0, 1.5, 4.5], size=(600, 3))

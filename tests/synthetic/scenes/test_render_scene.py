@@ -13,7 +13,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
 from nolbo_ppl.geometry.rotation import geodesic_angle, ray_rotation, viewpoint_to_matrix
 from nolbo_ppl.synthetic.assets.shape_library import SEED_STRIDE, ShapePool
-from nolbo_ppl.synthetic.renderer.camera_view import Mesh, Placed
+from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance
 from nolbo_ppl.synthetic.renderer.ray_casting import trace
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
 from nolbo_ppl.synthetic.scenes.label_arrays import allocentric_viewpoints, empty_labels, fill_rendered
@@ -89,7 +89,7 @@ def test_every_pixel_lies_on_the_labelled_shape(rendered: list[tuple[Scene, Rend
             assert near.mean() > 0.97, label.instance
 
 
-def _kept(scene: Scene, image: Rendered) -> tuple[Placed, ...]:
+def _kept(scene: Scene, image: Rendered) -> tuple[MeshInstance, ...]:
     """Clutter and the objects that kept their labels."""
     wanted = [id(label.R_camera_object) for label in image.labels]
     owners = {k for k, thing in enumerate(scene.objects) if id(thing.R_camera_object) in wanted}
@@ -157,7 +157,7 @@ def test_object_frame_shows_its_front_at_azimuth_zero() -> None:
             shape = pool.item("car", k).shape
             viewpoint = torch.tensor([azimuth, 0.2, 0.0], dtype=torch.float64)
             R = viewpoint_to_matrix(viewpoint).numpy()
-            thing = Placed(Mesh(shape.vertices, shape.faces, shape.part), R, np.array([0, 0, 1.6]), (), 0)
+            thing = MeshInstance(Mesh(shape.vertices, shape.faces, shape.part), R, np.array([0, 0, 1.6]), (), 0)
             view = replace(SceneSource(standard(64), seed=0, instances=1).scene(0).view, placed=(thing,))
             hits = trace(replace(view, intrinsics=np.array([90.0, 90, 32, 32])))
             parts = shape.part[hits.face[hits.index >= 0]]

@@ -89,9 +89,7 @@ def test_polygon_grid_agrees_with_its_triangles() -> None:
     points = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
     expected = np.zeros((37, 41), dtype=bool)
     for a, b, c in (L_PROFILE[list(t)] for t in triangulate(L_PROFILE)):
-        sides = [
-            (q - p)[0] * (points - p)[..., 1] - (q - p)[1] * (points - p)[..., 0] for p, q in ((a, b), (b, c), (c, a))
-        ]
+        sides = [(q - p)[0] * (points - p)[..., 1] - (q - p)[1] * (points - p)[..., 0] for p, q in ((a, b), (b, c), (c, a))]
         expected |= np.min(sides, axis=0) >= 0
     assert (grid_inside(L_PROFILE, x, y) == expected).all()
 
@@ -174,9 +172,7 @@ def test_inside_test_agrees_with_ray_casting(name: str) -> None:
     inside = primitive.inside(*axes, 0.0).ravel()
     assert 0.02 < inside.mean() < 0.98
     # Sides of a loft between polygons of different form are cut into two triangles: their middle differs a little.
-    assert (inside != mesh_contains(primitive, points)).mean() < (
-        1e-3 if name in ("box", "slanted", "clockwise") else 6e-3
-    )
+    assert (inside != mesh_contains(primitive, points)).mean() < (1e-3 if name in ("box", "slanted", "clockwise") else 6e-3)
 
 
 @pytest.mark.parametrize("name", PRIMITIVES)
@@ -402,9 +398,7 @@ def test_front_faces_minus_y(category: str) -> None:
         edge = item.vertices[item.faces[:, 1:]] - item.vertices[item.faces[:, :1]]
         area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=-1)
 
-        def middle(
-            roles: set[str], item: Shape = item, centre: np.ndarray = centre, area: np.ndarray = area
-        ) -> float | None:
+        def middle(roles: set[str], item: Shape = item, centre: np.ndarray = centre, area: np.ndarray = area) -> float | None:
             mask = np.isin(item.part, [i for i, role in enumerate(item.parts) if role in roles])
             return float(np.average(centre[mask, 1], weights=area[mask])) if mask.any() else None
 

@@ -17,9 +17,7 @@ from nolbo_ppl.io.files import read_json, read_jsonl, write_json, write_jsonl
 from nolbo_ppl.synthetic.worlds import DriveConfig, read_drive, write_drive
 from nolbo_ppl.synthetic.worlds import sequence_folder as folder
 
-CONFIG = DriveConfig(
-    world="indoor", frames=18, step=0.4, laps=0.25, objects=24, clutter=4, size=(96, 64), supersample=1, seed=8
-)
+CONFIG = DriveConfig(world="indoor", frames=18, step=0.4, laps=0.25, objects=24, clutter=4, size=(96, 64), supersample=1, seed=8)
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +38,15 @@ def copied(written: Path, tmp_path: Path) -> Path:
 def test_files_of_the_contract(written: Path) -> None:
     names = {path.name for path in written.iterdir()}
     assert names == {
-        "images", "intrinsics.json", "truth.txt", "times.txt", "objects.json", "scenes.jsonl", "voxels.npz", "drive.json"
-    }  # fmt: skip
+        "images",
+        "intrinsics.json",
+        "truth.txt",
+        "times.txt",
+        "objects.json",
+        "scenes.jsonl",
+        "voxels.npz",
+        "drive.json",
+    }
     assert sorted(path.name for path in (written / "images").iterdir()) == [f"{k:06d}.png" for k in range(18)]
     with Image.open(written / "images" / "000003.png") as image:
         assert image.size == (96, 64) and image.mode == "RGB"

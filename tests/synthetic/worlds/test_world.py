@@ -75,8 +75,9 @@ def test_objects_stand_apart_from_each_other_and_from_the_way(world: World) -> N
 def test_objects_stand_on_something(world: World) -> None:
     tops = {0.0, 0.12, 0.55} | {
         round(float(o.centre[2] + o.look.item.shape.dimensions[2] / 2), 6)
-        for o in world.objects if o.look.item.shape.category == "diningtable"
-    }  # fmt: skip
+        for o in world.objects
+        if o.look.item.shape.category == "diningtable"
+    }
     for thing in world.objects:
         foot = thing.centre[2] - thing.look.item.shape.dimensions[2] / 2
         assert min(abs(foot - top) for top in tops) < 1e-5, thing.id

@@ -95,9 +95,10 @@ def test_hidden_and_tiny_objects_have_no_label(street: World) -> None:
         ids = set(render_frame(strict, k).ids)
         loose = render_frame(street, k)
         expected = {
-            name for name, label in zip(loose.ids, loose.rendered.labels)
+            name
+            for name, label in zip(loose.ids, loose.rendered.labels)
             if label.visibility >= 0.6 and min(label.box[2:] - label.box[:2]) >= 15
-        }  # fmt: skip
+        }
         assert ids == expected
         np.testing.assert_array_equal(render_frame(strict, k).rendered.image, loose.rendered.image)  # still in the picture
 

@@ -97,10 +97,12 @@ class DriftGraph:
         rows.append(start + np.arange(6))
         columns.append(np.arange(6))
         entries.append(np.full(6, 1e6))
-        J = scipy.sparse.csc_matrix((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))),
-                                    shape=(start + 6, 6 * n))
-        factor = scipy.sparse.linalg.splu((J.T @ J).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                                          options={"SymmetricMode": True})
+        J = scipy.sparse.csc_matrix(
+            (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(start + 6, 6 * n)
+        )
+        factor = scipy.sparse.linalg.splu(
+            (J.T @ J).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
         return factor.solve(J.T @ rng.standard_normal((J.shape[0], count))).reshape(n, 6, count)
 
 

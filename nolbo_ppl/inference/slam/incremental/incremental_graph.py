@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from nolbo_ppl.inference.slam.graph import (
     GAUGE_SCALE,
-    Estimate,
     Links,
+    SlamEstimate,
     add_landmark_priors,
     add_links,
     add_observation_factors,
@@ -69,13 +69,19 @@ class OnlineGraph:
         return self.landmarks - 1
 
     def observe(
-        self, problem: SlamProblem, noise: NoiseModel, config: SlamConfig, rows: list[int], frame: int,
-        T_world_camera: Float[np.ndarray, "4 4"], landmarks: list[int],
+        self,
+        problem: SlamProblem,
+        noise: NoiseModel,
+        config: SlamConfig,
+        rows: list[int],
+        frame: int,
+        T_world_camera: Float[np.ndarray, "4 4"],
+        landmarks: list[int],
     ) -> None:
         """Factors of detections of one keyframe (`problem` holds that keyframe alone)."""
         if not rows:
             return
-        estimate = Estimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
+        estimate = SlamEstimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
         factors = resolve_observations(problem, noise, config, estimate, np.array(rows), np.arange(len(rows)), np.ones(len(rows)))
         factors = replace(factors, frame=np.full_like(factors.frame, frame), landmark=np.array(landmarks)[factors.landmark])
         add_observation_factors(self.graph, factors)

@@ -12,7 +12,7 @@ from nolbo_ppl.inference.slam.clusters import join
 from nolbo_ppl.inference.slam.consistent_cliques import find_closing
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, correlated_variance
 from nolbo_ppl.inference.slam.em import link_arrays, soft_assignment
-from nolbo_ppl.inference.slam.graph import Estimate, Links
+from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
 from nolbo_ppl.inference.slam.incremental.drift_graph import DriftGraph
 from nolbo_ppl.inference.slam.incremental.incremental_graph import OnlineGraph
 from nolbo_ppl.inference.slam.loop_candidates import (
@@ -94,9 +94,18 @@ class LoopCloser:
         tracks = [self.tracks[j] for j in near.tolist()]
         features = self._features(near, np.isin(near, window))
         samples = track_samples(poses, tracks, noise, error[self.drift.node(middle_frames(tracks))], rng)
-        found = find_links(np.flatnonzero(np.isin(near, window)), Estimate(np.zeros((0, 4, 4)), poses), samples, features,
-                           tracks, self.prior, self.config, self._links_among(near), floor=link_scale(noise),
-                           new_rate=noise.new_rate)
+        found = find_links(
+            np.flatnonzero(np.isin(near, window)),
+            SlamEstimate(np.zeros((0, 4, 4)), poses),
+            samples,
+            features,
+            tracks,
+            self.prior,
+            self.config,
+            self._links_among(near),
+            floor=link_scale(noise),
+            new_rate=noise.new_rate,
+        )
         if found:
             self._link(found, near, poses, features, link_scale(noise))
             if frame - self.solved_at >= LINK_INTERVAL and self.flush(graph):
@@ -123,9 +132,7 @@ class LoopCloser:
         for j in {*range(known, len(self.tracks)), *window.tolist()}:
             self.position[j] = graph.landmark(j)[:3, 3]
 
-    def _near(
-        self, window: Int[np.ndarray, " w"], error: Float[np.ndarray, "n 6 s"], floor: float
-    ) -> Int[np.ndarray, " c"]:
+    def _near(self, window: Int[np.ndarray, " w"], error: Float[np.ndarray, "n 6 s"], floor: float) -> Int[np.ndarray, " c"]:
         """Landmarks no farther from the window than the drift between their nodes can explain."""
         centre = self.position[window].mean(axis=0)
         reach = np.linalg.norm(self.position[window] - centre, axis=1).max()
@@ -147,16 +154,21 @@ class LoopCloser:
         latent = np.array([self.tracks[j].latent for j in everyone.tolist()])
         views = np.array([len(self.tracks[j].rows) for j in everyone.tolist()], dtype=np.float64)
         variance = correlated_variance(
-            np.array([self.tracks[j].latent_variance for j in everyone.tolist()]), views,
+            np.array([self.tracks[j].latent_variance for j in everyone.tolist()]),
+            views,
             self.config.latent_correlation or 0.0,
-        )  # fmt: skip
+        )
         rarity = log_population(latent, variance, np.flatnonzero(inside))
         tracks, count = [self.tracks[j] for j in near.tolist()], len(near)
         first = np.array([t.first for t in tracks])
         return TrackletFeatures(
-            latent=latent[:count], latent_variance=variance[:count], log_population=rarity[:count],
-            category=np.array([t.category for t in tracks]), symmetry=np.array([t.symmetry for t in tracks]),
-            oriented=np.array([t.oriented for t in tracks]), first=np.where(inside, first, -1),
+            latent=latent[:count],
+            latent_variance=variance[:count],
+            log_population=rarity[:count],
+            category=np.array([t.category for t in tracks]),
+            symmetry=np.array([t.symmetry for t in tracks]),
+            oriented=np.array([t.oriented for t in tracks]),
+            first=np.where(inside, first, -1),
             last=np.array([t.last for t in tracks]),
         )
 
@@ -167,8 +179,12 @@ class LoopCloser:
         return np.array(inside, dtype=np.int64).reshape(-1, 2)
 
     def _link(
-        self, found: list[tuple[int, int]], near: Int[np.ndarray, " c"], poses: Float[np.ndarray, "c 4 4"],
-        features: TrackletFeatures, scale: float,
+        self,
+        found: list[tuple[int, int]],
+        near: Int[np.ndarray, " c"],
+        poses: Float[np.ndarray, "c 4 4"],
+        features: TrackletFeatures,
+        scale: float,
     ) -> None:
         pairs = np.array(found, dtype=np.int64)
         links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
@@ -185,7 +201,10 @@ def middle_frames(tracks: list[Track]) -> Int[np.ndarray, " m"]:
 
 
 def track_samples(
-    T_world_landmark: Float[np.ndarray, "m 4 4"], tracks: list[Track], noise: NoiseModel, error: Float[np.ndarray, "m 6 s"],
+    T_world_landmark: Float[np.ndarray, "m 4 4"],
+    tracks: list[Track],
+    noise: NoiseModel,
+    error: Float[np.ndarray, "m 6 s"],
     rng: np.random.Generator,
 ) -> PosteriorSamples:
     """Samples of landmarks: the drift of their nodes, and the noise of their own detections."""
@@ -195,13 +214,14 @@ def track_samples(
         own = float(np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3))
         turn = float(np.median(noise.rotation_scale))
     share = 1.0 / np.sqrt([len(t.rows) for t in tracks])[:, None, None]
-    return PosteriorSamples(moved + own * share * rng.standard_normal(moved.shape),
-                            error[:, :3] + turn * share * rng.standard_normal(moved.shape))
+    return PosteriorSamples(
+        moved + own * share * rng.standard_normal(moved.shape), error[:, :3] + turn * share * rng.standard_normal(moved.shape)
+    )
 
 
 def find_links(
     window: Int[np.ndarray, " w"],
-    estimate: Estimate,
+    estimate: SlamEstimate,
     samples: PosteriorSamples,
     features: TrackletFeatures,
     tracks: list[Track],
@@ -216,8 +236,7 @@ def find_links(
     pairs = candidate_pairs(estimate, samples, features, prior, config, inflation=1.0, floor=floor)
     pairs = pairs.select(~np.isin(pairs.a, links[:, 0]))
     outside = pairs.select(~np.isin(pairs.b, window))
-    closing = find_closing(outside, estimate, samples, config, inflation=1.0, floor=floor,
-                           log_new=float(np.log(5.0 * new_rate)))
+    closing = find_closing(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=float(np.log(5.0 * new_rate)))
     found: list[tuple[int, int]] = []
     least = config.constellation_log_odds
     if closing and closing.log_odds > least and closing.margin > least / 2:

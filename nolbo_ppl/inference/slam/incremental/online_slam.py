@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
 from nolbo_ppl.inference.slam.detection_features import detection_features, fit_prior, fuse_latent
@@ -24,7 +25,7 @@ from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamPr
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.tracking import Tracker, summarise_tracks
-from nolbo_ppl.io.observations import ObservationTable, concatenate
+from nolbo_ppl.io.observations import Detections, concatenate
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class OnlineInfo:
     """Links closed at this keyframe."""
 
 
-class ObjectSlam:
+class IncrementalSlam:
     """Object SLAM fed keyframe by keyframe: `update(odometry, observations)`, then `finish()`.
 
     Scales that the configuration does not state are taken from a reference problem (the first part of a drive, or an
@@ -54,7 +55,7 @@ class ObjectSlam:
         self.reference: NoiseModel | None = None
         self.tracker: Tracker | None = None
         self.odometry: list[np.ndarray] = []
-        self.tables: list[ObservationTable] = []
+        self.tables: list[Detections] = []
         self.frame_of: list[int] = []
         self.assigned: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
@@ -69,7 +70,9 @@ class ObjectSlam:
     # -- one keyframe -------------------------------------------------------------------------------------------------
 
     def update(
-        self, odometry: Float[np.ndarray, "4 4"], observations: ObservationTable,
+        self,
+        odometry: Float[np.ndarray, "4 4"],
+        observations: Detections,
         odometry_covariance: Float[np.ndarray, "6 6"] | None = None,
     ) -> OnlineInfo:
         """Take the next keyframe.
@@ -110,7 +113,7 @@ class ObjectSlam:
         self.T_world_camera = self.graph.pose(frame)
         return OnlineInfo(frame, self.T_world_camera, self.graph.landmarks, closings)
 
-    def _begin(self, table: ObservationTable) -> None:
+    def _begin(self, table: Detections) -> None:
         """At the first keyframe: scales of the reference, and the prior of features."""
         if self.tracker is not None:
             return
@@ -150,11 +153,17 @@ class ObjectSlam:
             self.prior = fit_prior(table, self.config)
             self.factors = (1.0, 1.0, 1.0)
             rate = 1e-3
-            self.config = replace(self.config, new_rate=self.config.new_rate or rate,
-                                  clutter_rate=self.config.clutter_rate or 0.5 * rate)
+            self.config = replace(
+                self.config, new_rate=self.config.new_rate or rate, clutter_rate=self.config.clutter_rate or 0.5 * rate
+            )
         self.loops = LoopCloser(self.config, self.prior)
-        self.tracker = Tracker(self.config, table.latent_dim, self.prior, float(self.config.new_rate or 1e-3),
-                               float(self.config.clutter_rate or 1e-3))
+        self.tracker = Tracker(
+            self.config,
+            table.latent_dim,
+            self.prior,
+            float(self.config.new_rate or 1e-3),
+            float(self.config.clutter_rate or 1e-3),
+        )
 
     def _noise(self, problem: SlamProblem) -> NoiseModel:
         noise = estimate_noise(problem, self.config)
@@ -190,7 +199,7 @@ class ObjectSlam:
 
     def _track(
         self,
-        table: ObservationTable,
+        table: Detections,
         noise: NoiseModel,
         odometry: np.ndarray,
         frame: int,
@@ -220,7 +229,7 @@ class ObjectSlam:
 
     def _remember(
         self,
-        table: ObservationTable,
+        table: Detections,
         noise: NoiseModel,
         assigned: np.ndarray,
         start: int,
@@ -233,19 +242,24 @@ class ObjectSlam:
             if number < 0:
                 continue
             if number not in self.tracks:
-                self.tracks[number] = Track([start + i], -1, latent[i], variance[i], int(category[i]), int(symmetry[i]),
-                                            bool(table.has_rotation[i]), frame, frame)
+                self.tracks[number] = Track(
+                    [start + i],
+                    -1,
+                    latent[i],
+                    variance[i],
+                    int(category[i]),
+                    int(symmetry[i]),
+                    bool(table.has_rotation[i]),
+                    frame,
+                    frame,
+                )
                 continue
             track = self.tracks[number]
             track.rows.append(start + i)
             track.last = frame
-            track.latent, track.latent_variance = fuse_latent(
-                track.latent, track.latent_variance, latent[i], variance[i]
-            )
+            track.latent, track.latent_variance = fuse_latent(track.latent, track.latent_variance, latent[i], variance[i])
 
-    def _add_factors(
-        self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int
-    ) -> None:
+    def _add_factors(self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int) -> None:
         """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
         rows, landmarks = [], []
         for i, number in enumerate(assigned.tolist()):
@@ -266,7 +280,7 @@ class ObjectSlam:
         for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
             del self.pending[number]
 
-    def _found(self, track: Track, table: ObservationTable, i: int) -> None:
+    def _found(self, track: Track, table: Detections, i: int) -> None:
         """A new landmark at its latest detection, with its weak prior."""
         R = self.T_world_camera[:3, :3] @ table.rotation[i] if np.isfinite(table.rotation[i, 0, 0]) else np.eye(3)
         T = make_pose(R, transform(self.T_world_camera, table.position[i]))
@@ -294,9 +308,7 @@ class ObjectSlam:
         problem = SlamProblem(np.array(self.odometry), concatenate(self.tables), covariance)
         noise = estimate_noise(problem, self.config)
         prior = fit_prior(problem.observations, self.config)
-        tracklets = summarise_tracks(
-            problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights)
-        )
+        tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
         state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
         return complete(state)
 
@@ -306,10 +318,13 @@ def solve_online(problem: SlamProblem, config: SlamConfig | None = None, calibra
     first = problem.observations.select(problem.observations.frame < calibration_frames)
     covariance = problem.odometry_covariance
     part = None if covariance is None else covariance[: calibration_frames - 1]
-    slam = ObjectSlam(config, calibration=SlamProblem(problem.odometry[:calibration_frames], first, part))
+    slam = IncrementalSlam(config, calibration=SlamProblem(problem.odometry[:calibration_frames], first, part))
     order = np.argsort(problem.observations.frame, kind="stable")
     bounds = np.searchsorted(problem.observations.frame[order], np.arange(len(problem) + 1))
     for t in range(len(problem)):
         step = None if covariance is None or not t else covariance[t - 1]
         slam.update(problem.odometry[t], problem.observations.select(order[bounds[t] : bounds[t + 1]]), step)
     return slam.finish()
+
+
+__getattr__ = renamed(__name__, {"ObjectSlam": "IncrementalSlam"})

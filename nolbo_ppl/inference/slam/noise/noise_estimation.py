@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from nolbo_ppl.geometry.pose import relative, so3_log, transform
 from nolbo_ppl.inference.slam.orientation import nearest_of_modes, observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
-from nolbo_ppl.io.observations import ObservationTable
+from nolbo_ppl.io.observations import Detections
 
 MAD_TO_SCALE = 1.4826
 """Standard deviation of a normal variable over its median absolute deviation."""
@@ -77,9 +77,7 @@ def robust_scale(values: Float[np.ndarray, " n"]) -> float:
     return float(MAD_TO_SCALE * np.median(np.abs(values))) if len(values) else float("nan")
 
 
-def fit_range_model(
-    distance: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"], bins: int = 4
-) -> tuple[float, float]:
+def fit_range_model(distance: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"], bins: int = 4) -> tuple[float, float]:
     """Standard deviation `a + b * range` of single detections from differences `value` of two, by range quantile.
 
     Both are non-negative; the model never falls below a quarter of the overall scale.
@@ -125,11 +123,16 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     seen = max(len(np.unique(table.frame)), 1)
     rate = len(table) / seen / volume if len(table) else 1.0
     return NoiseModel(
-        rotation_step=rotation_step, translation_step=translation_step, position_covariance=covariance,
-        rotation_scale=rotation_scale, latent_scale=latent_scale,
+        rotation_step=rotation_step,
+        translation_step=translation_step,
+        position_covariance=covariance,
+        rotation_scale=rotation_scale,
+        latent_scale=latent_scale,
         new_rate=config.new_rate if config.new_rate is not None else 0.2 * rate,
         clutter_rate=config.clutter_rate if config.clutter_rate is not None else 0.1 * rate,
-        report=report, warnings=tuple(warnings), step_correlation=correlation,
+        report=report,
+        warnings=tuple(warnings),
+        step_correlation=correlation,
     )
 
 
@@ -141,8 +144,9 @@ def step_scales(
     if covariance is None:
         length = np.linalg.norm(np.diff(problem.odometry[:, :3, 3], axis=0), axis=1)
         return *odometry_scales(length, config), None
-    rotation, translation = (np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3)
-                             for part in (slice(3), slice(3, 6)))
+    rotation, translation = (
+        np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3) for part in (slice(3), slice(3, 6))
+    )
     scale = np.repeat(np.stack([rotation, translation], axis=1), 3, axis=1)
     return rotation, translation, covariance / scale[:, :, None] / scale[:, None, :]
 
@@ -163,7 +167,7 @@ def odometry_scales(
     return np.full(len(length), max(rotation, 1e-6)), np.maximum(translation, 1e-4 * typical)
 
 
-def view_volume(table: ObservationTable) -> float:
+def view_volume(table: Detections) -> float:
     """Volume detections come from, m^3: that of the ellipsoid uniform points of this covariance would fill."""
     if len(table) < 5:
         return 1000.0
@@ -179,7 +183,7 @@ def _ray_parts(position: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _position_covariance(
-    table: ObservationTable, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
+    table: Detections, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
 ) -> np.ndarray:
     given = np.isfinite(table.position_covariance).all(axis=(1, 2))
     distance = np.linalg.norm(table.position, axis=1)
@@ -192,8 +196,9 @@ def _position_covariance(
         length = np.linalg.norm(across, axis=1) * (1 / 1.1774 / MAD_TO_SCALE)
         a_lateral, b_lateral = fit_range_model(at, length)
         a_radial, b_radial = fit_range_model(at, along)
-        report.update(position_lateral=a_lateral, position_lateral_ratio=b_lateral, position_radial=a_radial,
-                      position_radial_ratio=b_radial)
+        report.update(
+            position_lateral=a_lateral, position_lateral_ratio=b_lateral, position_radial=a_radial, position_radial_ratio=b_radial
+        )
         # Errors of one object in following frames are alike (same view), so differences understate them.
         lateral, radial = 1.2 * (a_lateral + b_lateral * distance), 1.2 * (a_radial + b_radial * distance)
     else:
@@ -222,17 +227,16 @@ def _rotation_scale(
     default = config.rotation_scale
     if both.sum() >= 5:
         i, j = pairs.first[both], pairs.second[both]
-        carried = (
-            relative(problem.odometry[table.frame[j]], problem.odometry[table.frame[i]])[:, :3, :3] @ table.rotation[i]
-        )
+        carried = relative(problem.odometry[table.frame[j]], problem.odometry[table.frame[i]])[:, :3, :3] @ table.rotation[i]
         symmetry = resolved_symmetry(table, config)
         observed = nearest_of_modes(carried, observed_modes(table, np.ones(len(table)), j), symmetry[j])
         error = so3_log(np.swapaxes(carried, 1, 2) @ observed)
         error[symmetry[j] == 0, 2] = np.nan
         values = error[np.isfinite(error)]
         # A third of detectors' angles are nearly constrained (upright objects): the widest axis is the scale.
-        widest = max(robust_scale(error[:, k][np.isfinite(error[:, k])]) for k in range(3)
-                     if np.isfinite(error[:, k]).any()) / np.sqrt(2)
+        widest = max(
+            robust_scale(error[:, k][np.isfinite(error[:, k])]) for k in range(3) if np.isfinite(error[:, k]).any()
+        ) / np.sqrt(2)
         report["rotation_scale"] = widest
         if default is None:
             default = max(1.2 * widest, 1e-3)
@@ -250,7 +254,7 @@ def _rotation_scale(
 
 
 def _latent_scale(
-    table: ObservationTable, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
+    table: Detections, pairs: DetectionPairs, config: SlamConfig, report: dict[str, float], warnings: list[str]
 ) -> np.ndarray:
     scale = table.latent_scale.copy()
     if not table.latent_dim:

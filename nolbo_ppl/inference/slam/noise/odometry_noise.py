@@ -8,8 +8,8 @@ import numpy as np
 
 from nolbo_ppl.geometry.pose import adjoint, inverse, se3_log
 from nolbo_ppl.inference.slam.graph import (
-    Estimate,
     Linearisation,
+    SlamEstimate,
     add_landmark_priors,
     add_observation_factors,
     linearise,
@@ -40,7 +40,8 @@ def stated_scales(problem: SlamProblem, config: SlamConfig) -> tuple[bool, bool]
     if problem.odometry_covariance is not None:
         return True, True
     return config.odometry_rotation_scale is not None, (
-        config.odometry_translation_scale is not None or config.odometry_translation_ratio is not None)
+        config.odometry_translation_scale is not None or config.odometry_translation_ratio is not None
+    )
 
 
 def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
@@ -67,9 +68,17 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
         latent_scale=state.noise.latent_scale[state.rows[inside]],
     )
     problem = SlamProblem(state.problem.odometry[first : first + length], table)
-    estimate = Estimate(state.estimate.T_world_camera[first : first + length], state.estimate.T_world_landmark[names])
-    return replace(state, problem=problem, noise=noise, rows=np.arange(len(table)), landmark=landmark.astype(np.int64),
-                   weight=state.weight[inside], static=names, estimate=estimate)
+    estimate = SlamEstimate(state.estimate.T_world_camera[first : first + length], state.estimate.T_world_landmark[names])
+    return replace(
+        state,
+        problem=problem,
+        noise=noise,
+        rows=np.arange(len(table)),
+        landmark=landmark.astype(np.int64),
+        weight=state.weight[inside],
+        static=names,
+        estimate=estimate,
+    )
 
 
 def log_evidence(window: SlamState, rotation: float, translation: float) -> float:
@@ -77,11 +86,15 @@ def log_evidence(window: SlamState, rotation: float, translation: float) -> floa
 
     Detections have heavy tails here.
     """
-    noise = replace(window.noise, rotation_step=window.noise.rotation_step * rotation,
-                    translation_step=window.noise.translation_step * translation)
+    noise = replace(
+        window.noise,
+        rotation_step=window.noise.rotation_step * rotation,
+        translation_step=window.noise.translation_step * translation,
+    )
     graph = odometry_factors(window.problem, noise)
-    factors = resolve_observations(window.problem, noise, window.config, window.estimate, window.rows, window.landmark,
-                                   window.weight)
+    factors = resolve_observations(
+        window.problem, noise, window.config, window.estimate, window.rows, window.landmark, window.weight
+    )
     add_observation_factors(graph, factors, robust_width=ROBUST_WIDTH)
     add_landmark_priors(graph, window.estimate.T_world_landmark, window.typical_range)
     estimate, _, error = optimise(graph, window.estimate, iterations=10)
@@ -114,8 +127,12 @@ def odometry_by_evidence(state: SlamState) -> SlamState:
                         factors, best, improved = trial, value, True
                         break
     report = dict(state.noise.report)
-    noise = replace(state.noise, rotation_step=state.noise.rotation_step * factors[0],
-                    translation_step=state.noise.translation_step * factors[1], report=report)
+    noise = replace(
+        state.noise,
+        rotation_step=state.noise.rotation_step * factors[0],
+        translation_step=state.noise.translation_step * factors[1],
+        report=report,
+    )
     report["odometry_rotation_scale"] = float(np.median(noise.rotation_step))
     report["odometry_translation_scale"] = float(np.median(noise.translation_step))
     return replace(state, noise=noise)
@@ -158,8 +175,13 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
                 warnings = [w for w in warnings if not w.startswith(f"stated odometry {name}")] + [text]
                 factor = ratio if state.config.correct_scales else 1.0
         factors.append(factor)
-    noise = replace(state.noise, rotation_step=state.noise.rotation_step * factors[0],
-                    translation_step=state.noise.translation_step * factors[1], report=report, warnings=tuple(warnings))
+    noise = replace(
+        state.noise,
+        rotation_step=state.noise.rotation_step * factors[0],
+        translation_step=state.noise.translation_step * factors[1],
+        report=report,
+        warnings=tuple(warnings),
+    )
     report["odometry_rotation_scale"] = float(np.median(noise.rotation_step))
     report["odometry_translation_scale"] = float(np.median(noise.translation_step))
     return replace(state, noise=noise)

@@ -31,9 +31,7 @@ LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
 
-def correlation_factor(
-    whitened: Float[np.ndarray, "k c"], track: Int[np.ndarray, " k"], frame: Int[np.ndarray, " k"]
-) -> float:
+def correlation_factor(whitened: Float[np.ndarray, "k c"], track: Int[np.ndarray, " k"], frame: Int[np.ndarray, " k"]) -> float:
     """Factor on covariances that makes up for correlated errors: `(1 + r) / (1 - r)` of a first-order process, at least 1."""
     order = np.lexsort((frame, track))
     z = np.clip(whitened[order], -CLIP, CLIP)
@@ -79,21 +77,27 @@ def calibrate(state: SlamState) -> SlamState:
     frame = table.frame[rows]
     count = np.bincount(state.landmark, minlength=len(state.static))[state.landmark].astype(np.float64)
     report, warnings = dict(noise.report), list(noise.warnings)
-    predicted = transform(
-        inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
-    )
+    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
     whitening = np.linalg.inv(np.linalg.cholesky(noise.position_covariance[rows]))
     z = np.einsum("kij,kj->ki", whitening, table.position[rows] - predicted)
     ratio = _width(z, count)
     stated = np.isfinite(table.position_covariance).all(axis=(1, 2))
-    factor = np.where(stated, _stated_factor(ratio, "position", stated[rows], config.correct_scales, warnings),
-                      np.nan_to_num(max(ratio, 1.0), nan=1.0))
+    factor = np.where(
+        stated,
+        _stated_factor(ratio, "position", stated[rows], config.correct_scales, warnings),
+        np.nan_to_num(max(ratio, 1.0), nan=1.0),
+    )
     report["position_track_width"] = ratio
-    across, along = (1.0, 1.0) if stated[rows].any() else (
-        UNSTATED_FACTOR, unstated_range_factor(noise.report, state.typical_range))
+    across, along = (
+        (1.0, 1.0) if stated[rows].any() else (UNSTATED_FACTOR, unstated_range_factor(noise.report, state.typical_range))
+    )
     report["position_correlation_factor"] = position_factor = correlation_factor(z, state.landmark, frame)
-    noise = replace(noise, position_covariance=noise.position_covariance * (factor**2)[:, None, None],
-                    position_factor=max(position_factor, across), range_factor=max(position_factor, along))
+    noise = replace(
+        noise,
+        position_covariance=noise.position_covariance * (factor**2)[:, None, None],
+        position_factor=max(position_factor, across),
+        range_factor=max(position_factor, along),
+    )
     oriented = np.flatnonzero(table.has_rotation[rows])
     if len(oriented) >= LEAST_DETECTIONS:
         k, j = rows[oriented], state.landmark[oriented]
@@ -106,13 +110,14 @@ def calibrate(state: SlamState) -> SlamState:
             w, k, j = w[usable], k[usable], j[usable]
             ratio = max((_width(w[:, [c]], count[oriented][usable]) for c in range(3)), default=float("nan"))
             stated = np.isfinite(table.rotation_scale)
-            factor = np.where(stated, _stated_factor(ratio, "rotation", stated[k], config.correct_scales, warnings),
-                              np.nan_to_num(max(ratio, 1.0), nan=1.0))
+            factor = np.where(
+                stated,
+                _stated_factor(ratio, "rotation", stated[k], config.correct_scales, warnings),
+                np.nan_to_num(max(ratio, 1.0), nan=1.0),
+            )
             report["rotation_track_width"] = ratio
             least = 1.0 if stated[k].any() else UNSTATED_ROTATION_FACTOR
-            report["rotation_correlation_factor"] = rotation_factor = max(
-                correlation_factor(w, j, table.frame[k]), least
-            )
+            report["rotation_correlation_factor"] = rotation_factor = max(correlation_factor(w, j, table.frame[k]), least)
             noise = replace(noise, rotation_scale=noise.rotation_scale * factor, rotation_factor=rotation_factor)
     clean = {name: value for name, value in report.items() if np.isfinite(value)}
     return replace(state, noise=replace(noise, report=clean, warnings=tuple(dict.fromkeys(warnings))))
@@ -122,7 +127,5 @@ def _stated_factor(ratio: float, name: str, stated: np.ndarray, correct: bool, w
     if not stated.any() or not np.isfinite(ratio) or ratio < TOO_SMALL:
         return 1.0
     if not any(w.startswith(f"stated {name} scales") for w in warnings):
-        warnings.append(
-            f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide"
-        )
+        warnings.append(f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide")
     return ratio if correct else 1.0
