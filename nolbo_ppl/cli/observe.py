@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 from tqdm import tqdm
 
+from nolbo_ppl.data.sequences.image_sequence import FrameSequence
+from nolbo_ppl.data.sequences.opening import open_frames
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
 from nolbo_ppl.io.files import atomic_path, write_jsonl
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-"""Files of these names are images."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,8 @@ class ObserveConfig:
     """What to observe and where to write."""
 
     images: Path
-    """Folder of images; a detection's `frame` is the index of its image in sorted order."""
+    """Folder of images or a video; a detection's `frame` is the index of its image in natural order of the names (frame2
+    before frame10), the same as in `nolbo odometry` and `nolbo run`."""
     out: Path
     """Folder for observations.jsonl and the pictures."""
     model: str = "tiny"
@@ -58,62 +57,39 @@ class ObserveSummary:
     """The observations."""
 
 
-def image_paths(folder: Path) -> list[Path]:
-    """Images of a folder in sorted order.
-
-    Raises:
-        InputError: no such folder, or no image in it.
-    """
-    if not folder.is_dir():
-        raise input_error("no such folder of images", file=folder)
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-    if not paths:
-        raise input_error("a folder without images", expected=f"files named {', '.join(IMAGE_SUFFIXES)}", file=folder)
-    return paths
-
-
-def read_image(path: Path) -> np.ndarray:
-    """An image file as uint8 [height, width, 3]. Raises `InputError` naming the file when it cannot be decoded."""
-    try:
-        with Image.open(path) as opened:
-            return np.asarray(opened.convert("RGB"))
-    except (OSError, UnidentifiedImageError) as error:
-        raise input_error("not a readable picture", got=error, file=path) from None
-
-
 def run(config: ObserveConfig) -> ObserveSummary:
     """Observe every image of the folder; `observations.jsonl` appears complete or not at all."""
-    paths, model = image_paths(config.images), load(config.model)
+    frames, model = open_frames(config.images), load(config.model)
     if config.out.resolve() == config.images.resolve():
         raise input_error("pictures would be written over the images", got=config.out, do="choose another --out")
     config.out.mkdir(parents=True, exist_ok=True)
-    rows = list(_rows(config, paths, model))
+    rows = list(_rows(config, frames, model))
     write_jsonl(config.out / "observations.jsonl", rows)
-    return ObserveSummary(len(paths), len(rows), config.out / "observations.jsonl")
+    return ObserveSummary(len(frames), len(rows), config.out / "observations.jsonl")
 
 
-def _rows(config: ObserveConfig, paths: list[Path], model: ObservationModel) -> Iterator[dict]:
-    bar = tqdm(total=len(paths), desc="observing", unit="image", disable=None)
+def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel) -> Iterator[dict]:
+    bar = tqdm(total=len(frames), desc="observing", unit="image", disable=None)
     with bar:
-        for first in range(0, len(paths), config.batch):
-            part = paths[first : first + config.batch]
-            images = [read_image(path) for path in part]
+        for first in range(0, len(frames), config.batch):
+            part = range(first, min(first + config.batch, len(frames)))
+            images = [frames.image(k) for k in part]
             observed = model.observe(
                 images, config.intrinsics, threshold=config.threshold, size=config.size, batch=config.batch, seed=config.seed
             )
-            for offset, (path, image, observations) in enumerate(zip(part, images, observed)):
-                yield from observations.rows(first + offset, path.name)
+            for k, image, observations in zip(part, images, observed):
+                yield from observations.rows(k, frames.name(k))
                 if config.pictures:
-                    _draw(config, path, image, observations, model)
+                    _draw(config, frames.name(k), image, observations, model)
             bar.update(len(part))
 
 
-def _draw(config: ObserveConfig, path: Path, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:
+def _draw(config: ObserveConfig, name: str, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:
     """The posterior over the image, as `OUT/NAME.png`."""
     from nolbo_ppl.viz.posterior_plots import draw_observations  # matplotlib is only needed for pictures
 
     camera = guessed_intrinsics(image) if config.intrinsics is None else np.array(config.intrinsics)
-    with atomic_path(config.out / f"{path.stem}.png") as temporary:
+    with atomic_path(config.out / f"{name if '#' in name else Path(name).stem}.png") as temporary:
         draw_observations(image, observations, camera, prior_mean=model.prior_mean(), path=temporary)
 
 

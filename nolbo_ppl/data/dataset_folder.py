@@ -14,6 +14,7 @@ from PIL import Image
 from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import read_jsonl
+from nolbo_ppl.io.images import image_size, open_image
 from nolbo_ppl.io.scenes import SceneRecord, image_field, parse_record
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.dataset_writer import SCENES
@@ -107,13 +108,9 @@ class SceneFolder:
         file = self.path / SCENES
         for line, row in read_jsonl(file):
             image = image_field(row, self.path, file, line)
-            try:
-                with Image.open(image) as opened:
-                    image_size = opened.size
-            except OSError as error:
-                raise input_error("image", got=error, expected="a readable picture", file=file, line=line) from None
-            self.records.append(parse_record(row, file, line, self.categories, image_size, image, self._symmetries))
-            self.image_sizes.append(image_size)
+            size = image_size(image, named_by=(file, line))
+            self.records.append(parse_record(row, file, line, self.categories, size, image, self._symmetries))
+            self.image_sizes.append(size)
         if not self.records:
             raise input_error("a data set without images", got=file, expected="at least one line")
 
@@ -174,12 +171,7 @@ class SceneFolder:
 
     def image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """The image of a row at its own size. Raises `InputError` when it cannot be decoded."""
-        path = self.records[index].image
-        try:
-            with Image.open(path) as opened:
-                return np.asarray(opened.convert("RGB"))
-        except OSError as error:
-            raise input_error("not a readable picture", got=error, file=path) from None
+        return open_image(self.records[index].image)
 
     def intrinsics(self, index: int) -> Float[np.ndarray, " 4"]:
         """Intrinsics of a row at the image's own size."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.images import open_depth_image
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 CENTRAL = 0.5
@@ -47,15 +48,7 @@ def read_depth(path: Path, scale: DepthScale) -> Float[np.ndarray, "h w"]:
     Raises:
         InputError: no readable picture of one 16 bit channel.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as opened:
-            raw = np.asarray(opened)
-    except (OSError, UnidentifiedImageError) as error:
-        raise input_error("not a readable depth picture", got=error, file=path) from None
-    if raw.ndim != 2 or raw.dtype not in (np.dtype(np.uint16), np.dtype(np.int32)):
-        raise input_error("not a depth picture", got=f"{raw.dtype} {raw.shape}", expected="one channel of 16 bits", file=path)
+    raw = open_depth_image(path)
     return np.where(raw > 0, raw * scale.unit, np.nan)
 
 

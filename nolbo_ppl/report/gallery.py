@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.io.images import open_image
 from nolbo_ppl.report.report_plots import category_number, colour_of
 from nolbo_ppl.report.run_folder import RunFolder
 from nolbo_ppl.report.run_landmarks import RunLandmark
@@ -33,9 +35,9 @@ def pictures(run: RunFolder, landmark: RunLandmark) -> str:
     crop, voxels, out = run.crop(landmark.name), run.voxels(landmark.name), ""
     if crop is not None:
         try:
-            with Image.open(crop) as image:
-                out += _image(photo_uri(image, 224), f"best view of {landmark.name}", "best view")
-        except (OSError, UnidentifiedImageError):
+            image = Image.fromarray(open_image(crop, shorter_side=224))
+            out += _image(photo_uri(image, 224), f"best view of {landmark.name}", "best view")
+        except InputError:
             out += _image("", "", "best view", "unreadable picture")
     elif (run.path / "crops").is_dir():
         out += _image("", "", "best view", "no picture")

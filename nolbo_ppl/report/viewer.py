@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nolbo_ppl.errors import input_error
+from nolbo_ppl.errors import InputError, input_error
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
+from nolbo_ppl.io.images import open_image
 from nolbo_ppl.report.run_folder import RunFolder, read_run
 from nolbo_ppl.report.viewer_objects import Rgb, add_objects
 
@@ -94,15 +95,14 @@ def scene_scale(run: RunFolder) -> float:
 
 def read_picture(run: RunFolder, k: int, longest: int) -> UInt8[np.ndarray, "h w 3"] | None:
     """Picture of a keyframe, no side longer than `longest` px; None where there is none."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     path = run.images[k] if run.images else None
     if path is None:
         return None
     try:
-        with Image.open(path) as opened:
-            image = opened.convert("RGB")
-    except (OSError, UnidentifiedImageError):
+        image = Image.fromarray(open_image(path, shorter_side=longest))
+    except InputError:
         return None
     image.thumbnail((longest, longest))
     return np.asarray(image)

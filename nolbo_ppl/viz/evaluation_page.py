@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.io.images import open_image
 
 CAPTIONS = {
     "precision_recall": "Precision against recall: every detection by its objectness (left), each category by its own score.",
@@ -112,8 +113,7 @@ def _embedded(picture: Path) -> str:
         from PIL import Image
 
         buffer = BytesIO()
-        with Image.open(picture) as opened:
-            opened.convert("RGB").save(buffer, "JPEG", quality=88)
+        Image.fromarray(open_image(picture)).save(buffer, "JPEG", quality=88)
         data, kind = buffer.getvalue(), "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 

@@ -148,5 +148,5 @@ def test_depth_pictures(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="one channel of 16 bits"):
         read_depth(tmp_path / "colour.png", DepthScale())
     (tmp_path / "text.png").write_text("no picture")
-    with pytest.raises(InputError, match="not a readable depth picture"):
+    with pytest.raises(InputError, match="not a readable depth image"):
         read_depth(tmp_path / "text.png", DepthScale())

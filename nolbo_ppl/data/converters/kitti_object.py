@@ -22,6 +22,7 @@ from nolbo_ppl.data.converters.kitti_tracking import car_rotation
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.rotation import matrix_to_quaternion
 from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
+from nolbo_ppl.io.images import image_size, images_of
 from nolbo_ppl.synthetic.dataset_writer import SCENES
 
 CATEGORY = {"Car": "car"}
@@ -213,19 +214,14 @@ def convert_kitti_object(data: str | PathLike[str], out: str | PathLike[str]) ->
     Raises:
         InputError: files are missing or malformed.
     """
-    from PIL import Image
-
     folder, out = Path(data), Path(out)
     pictures = existing(folder / "image_2", "images of KITTI")
-    images = sorted(path for path in pictures.iterdir() if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    if not images:
-        raise input_error("no image", got=pictures, expected="JPEG or PNG files")
+    images = images_of(pictures)
     rows, cameras = [], {}
     for path in images:
         labels = read_object_labels(existing(folder / "label_2" / f"{path.stem}.txt", "labels"))
         camera, cameras[path.name] = camera_of_image(folder / "calib" / f"{path.stem}.txt", labels)
-        with Image.open(path) as opened:
-            rows.append(scene_row(f"images/{path.name}", labels, camera, *opened.size))
+        rows.append(scene_row(f"images/{path.name}", labels, camera, *image_size(path)))
     for path in images:
         with atomic_path(out / "images" / path.name) as temporary:
             shutil.copyfile(path, temporary)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from os import PathLike
@@ -10,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.images import IMAGE_SUFFIXES
+from nolbo_ppl.io.images import IMAGE_SUFFIXES, image_size, list_images, open_depth_image, open_image
 from nolbo_ppl.io.text import read_words
 from nolbo_ppl.io.trajectories import match_times
 
@@ -40,6 +38,14 @@ class FrameSequence(ABC):
         Raises:
             InputError: no such frame, a file that is no image, or one of another size than the first.
         """
+
+    def image(self, k: int, /) -> UInt8[np.ndarray, "h w 3"]:
+        """Frame k in RGB, at its own size where the sizes of a folder's images differ.
+
+        Raises:
+            InputError: no such frame, or a file that is no image.
+        """
+        return self.frame(k)
 
     @abstractmethod
     def time(self, k: int, /) -> float | None:
@@ -71,16 +77,7 @@ class FrameSequence(ABC):
             raise input_error("no such frame", got=k, expected=f"0 to {len(self) - 1}", file=self.path)
 
 
-def natural(path: Path) -> tuple[tuple[tuple[int, int, str], ...], str]:
-    """Key of sorting in which frame2 comes before frame10; the plain name settles ties such as 01 and 1."""
-    pieces = re.split(r"(\d+)", path.name)
-    return tuple((0, int(piece), "") if piece.isdecimal() else (1, 0, piece) for piece in pieces), path.name
-
-
-def list_frames(folder: Path) -> list[Path]:
-    """Images of a folder (not of those inside it) in natural order; hidden files are passed over."""
-    found = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith("."))
-    return sorted(found, key=natural)
+list_frames = list_images  # its name of 0.1.0
 
 
 def read_column(path: str | PathLike[str], what: str) -> list[tuple[int, float]]:
@@ -129,17 +126,8 @@ def read_lengths(path: str | PathLike[str]) -> Float[np.ndarray, " n"]:
 
 
 def read_image(path: Path, file: Path | None = None, line: int | None = None) -> UInt8[np.ndarray, "h w 3"]:
-    """An image as RGB; grey ones of 16 bits keep their upper 8. `file` and `line` name the list that named it."""
-    try:
-        with Image.open(path) as opened:
-            if opened.mode.startswith("I"):
-                values = np.asarray(opened, dtype=np.int64)
-                return np.repeat(np.clip(values >> 8, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-            return np.asarray(opened.convert("RGB"))
-    except (OSError, SyntaxError, ValueError) as error:  # Pillow raises all three for damaged files
-        if file is None:
-            raise input_error("not a readable image", got=error, file=path) from None
-        raise input_error(f"image {path.name}", got=error, expected="a readable image", file=file, line=line) from None
+    """`open_image`; `file` and `line` name the list that named the image."""
+    return open_image(path, named_by=None if file is None else (file, line))
 
 
 class ImageFolder(FrameSequence):
@@ -161,23 +149,24 @@ class ImageFolder(FrameSequence):
     def __len__(self) -> int:
         return len(self.files)
 
-    def _read(self, k: int) -> UInt8[np.ndarray, "h w 3"]:
-        if self._listing is None:
-            return read_image(self.files[k])
-        return read_image(self.files[k], self._listing[0], self._listing[1][k])
+    def _named_by(self, k: int) -> tuple[Path, int] | None:
+        return None if self._listing is None else (self._listing[0], self._listing[1][k])
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the first frame, px."""
         if self._size is None:
-            height, width = self._read(0).shape[:2]
-            self._size = width, height
+            self._size = image_size(self.files[0], named_by=self._named_by(0))
         return self._size
+
+    def image(self, k: int, /) -> UInt8[np.ndarray, "h w 3"]:
+        """Frame k in RGB, at its own size."""
+        self.check(k)
+        return open_image(self.files[k], named_by=self._named_by(k))
 
     def frame(self, k: int, /) -> UInt8[np.ndarray, "h w 3"]:
         """Frame k in RGB."""
-        self.check(k)
-        image = self._read(k)
+        image = self.image(k)
         found = image.shape[1], image.shape[0]
         if found != self.size:
             raise input_error(
@@ -246,11 +235,7 @@ class TumFolder(ImageFolder):
         if k not in self.depth_files:
             return None
         file = self.depth_files[k]
-        try:
-            with Image.open(file) as opened:
-                values = np.asarray(opened)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise input_error("not a readable depth image", got=error, file=file) from None
-        if values.ndim != 2 or values.shape != (self.size[1], self.size[0]):
+        values = open_depth_image(file)
+        if values.shape != (self.size[1], self.size[0]):
             raise input_error("depth image of another shape", got=values.shape, expected=(self.size[1], self.size[0]), file=file)
         return values.astype(np.float64) * TUM_DEPTH_UNIT

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.images import PICTURE_SUFFIXES
+from nolbo_ppl.io.images import images_of, open_image
 from nolbo_ppl.synthetic.renderer import textures
 from nolbo_ppl.synthetic.renderer.materials import hsv
 
@@ -23,13 +22,7 @@ KEPT = 512
 
 def list_pictures(folder: str | PathLike[str]) -> list[Path]:
     """Pictures of a folder and its sub-folders, sorted by path. Raises `InputError` when there is none."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise input_error("no such folder of pictures", got=folder, expected="a folder of .jpg or .png files")
-    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
-    if not found:
-        raise input_error("no picture in the folder", got=folder, expected="files ending in " + ", ".join(PICTURE_SUFFIXES))
-    return found
+    return sorted(images_of(folder, recursive=True))
 
 
 class Photographs:
@@ -45,13 +38,7 @@ class Photographs:
 
     def _decoded(self, number: int) -> UInt8[np.ndarray, "h w 3"]:
         if number not in self._kept:
-            path = self.paths[number]
-            try:
-                with Image.open(path) as file:
-                    file.draft("RGB", (2 * self.size, 2 * self.size))
-                    picture = file.convert("RGB")
-            except OSError as error:
-                raise input_error("not a readable picture", got=error, file=path) from None
+            picture = Image.fromarray(open_image(self.paths[number], shorter_side=2 * self.size))
             factor = min(1.0, 2 * self.size / min(picture.size))
             if factor < 1:
                 shape = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))

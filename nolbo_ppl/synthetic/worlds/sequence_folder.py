@@ -22,6 +22,7 @@ from tqdm import tqdm
 from nolbo_ppl._version import __version__
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.io.images import open_image
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.synthetic.worlds.world import World, make_world
@@ -179,9 +180,5 @@ def _summary(out: Path) -> DriveSummary:
 
 
 def read_image(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
-    """An image as RGB. Raises `InputError` when it cannot be read."""
-    try:
-        with Image.open(path) as file:
-            return np.asarray(file.convert("RGB"))
-    except OSError as error:
-        raise input_error("not a readable image", got=error, file=path) from None
+    """`nolbo_ppl.io.images.open_image` under its name of 0.1.0."""
+    return open_image(path)
