@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from nolbo_ppl.inference.elbo import INCLUSIVE, INCLUSIVE_TERMS, PURE_BOUND, SceneELBO
-from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.scene_batch import SceneBatch
 
 FORMS = ("mixture", "angle", "sincos")

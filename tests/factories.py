@@ -14,10 +14,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from nolbo_ppl.models.guide import Encoding, ObservedScene
-from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, encode_box, encode_range, grid_size, pack_bits
 
 FOCAL = 80.0

@@ -35,9 +35,9 @@ from nolbo_ppl.models.distributions import (
     WrappedNormal,
 )
 from nolbo_ppl.models.distributions.bernoulli import Objectness
-from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import world_size
+from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.rotation_term import expected_rotation_log_prob
 from nolbo_ppl.models.scene_batch import SceneBatch, unpack_bits
@@ -92,7 +92,7 @@ class GenerativeModel(nn.Module):
         with scenes, pyro.plate("regions", where.is_object.shape[1], dim=-1):
             eps = config.objectness_epsilon
             logit = math.log1p(-eps) - math.log(eps)
-            prior = Objectness(logits=torch.where(where.is_object, logit, -logit).to(scene.encoding.objectness_logit))
+            prior = Objectness(logits=torch.where(where.is_object, logit, -logit).to(batch.box))
             pyro.sample("objectness", prior, infer={"truth": prior})
         with scenes, pyro.plate("objects", where.assigned.shape[1], dim=-1), poutine.mask(mask=where.assigned):
             latent = shape_site(self.prior, batch, where.assigned)

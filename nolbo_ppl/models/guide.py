@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import pyro
 import pyro.distributions as dist
 import torch
@@ -22,34 +19,11 @@ from nolbo_ppl.models.distributions import (
     kl_to_each_component,
 )
 from nolbo_ppl.models.distributions.bernoulli import Objectness
-from nolbo_ppl.models.head import RegionHead, RegionParameters
+from nolbo_ppl.models.head import RegionHead
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
-
-
-@dataclass
-class Encoding:
-    """What the encoder made of a batch of images."""
-
-    features: Float[Tensor, "b cells c"]
-    """Features of each cell."""
-    objectness_logit: Float[Tensor, "b k"]
-    """Log odds of q(o | I) of every region; region = cell * predictors + predictor."""
-    rows: int
-    columns: int
-    fine: tuple[Float[Tensor, "b _ _ _"], ...] = ()
-    """Finer maps of the encoder, for the second look at each object."""
-
-
-@dataclass
-class ObservedScene:
-    """A batch with its encoding, its responsible regions and their posterior: what story and guide are run on."""
-
-    batch: SceneBatch
-    encoding: Encoding
-    assignment: Assignment
-    posterior: RegionParameters
 
 
 def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> dist.TorchDistribution:
@@ -77,9 +51,12 @@ class Guide(nn.Module):
         self.config = config
         self.encoder = make_encoder(config)
         self.head = RegionHead(self.encoder.channels, config, self.encoder.fine_channels, self.encoder.fine_strides)
-        self._prior: Callable[[], LabelPrior] = lambda: prior  # owned by the story, shared here
+        self._shared = (prior,)  # the generative model's own: a tuple, so that it is no module of the guide's state
         self.half_precision = False
         """Run encoder and head in bfloat16, everything after them in the weights' own precision."""
+
+    def _prior(self) -> LabelPrior:
+        return self._shared[0]
 
     def encode(self, image: Tensor) -> Encoding:
         """Run the encoder on whole images, uint8 or float in 0..255, sides multiples of 32.

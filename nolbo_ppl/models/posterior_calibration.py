@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.models.head import RegionParameters
+from nolbo_ppl.models.observed_scene import RegionParameters
 
 
 @dataclass(frozen=True)

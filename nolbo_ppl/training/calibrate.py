@@ -16,8 +16,8 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import wrap_angle
 from nolbo_ppl.inference.posterior.decode import box_scales, position_covariance
 from nolbo_ppl.models.distributions import VonMisesMixture
-from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, decode_box, decode_range
 

@@ -10,8 +10,9 @@ import torch
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SceneELBO
-from nolbo_ppl.models.guide import ObservedScene, orientation_posterior
+from nolbo_ppl.models.guide import orientation_posterior
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.scene_batch import SceneBatch, decode_box
 
 

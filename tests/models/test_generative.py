@@ -14,8 +14,8 @@ from scipy.stats import chisquare
 
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
 from nolbo_ppl.models.generative import conjugate_truth
-from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.observed_scene import ObservedScene
 from tests.factories import instance_config, observed_scene, random_batch, repeat_scene, tiny_config, tiny_model
 
 

@@ -7,7 +7,8 @@ import math
 
 import torch
 
-from nolbo_ppl.models.head import RegionHead, RegionParameters
+from nolbo_ppl.models.head import RegionHead
+from nolbo_ppl.models.observed_scene import RegionParameters
 from tests.factories import instance_config, tiny_config, tiny_model
 
 

@@ -10,7 +10,8 @@ from scipy.stats import chi2
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.models.distributions import VonMisesMixture
-from nolbo_ppl.models.guide import Guide, ObservedScene
+from nolbo_ppl.models.guide import Guide
+from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.scene_batch import SceneBatch, decode_box, decode_range, encode_box
 from nolbo_ppl.training import calibrate as module
 from nolbo_ppl.training.calibrate import calibrate, position_factor, region_factor, view_correlation

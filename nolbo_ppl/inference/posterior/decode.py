@@ -14,8 +14,8 @@ from torch import Tensor
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer
 from nolbo_ppl.models.distributions import VonMisesMixture, kl_to_each_component
-from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import decode_box, decode_range
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes

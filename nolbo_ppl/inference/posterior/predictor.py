@@ -19,9 +19,8 @@ from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer, decode_lat
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
 from nolbo_ppl.inference.posterior.preprocess import Prepared, prepare_all, same_shape
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guessed_intrinsics
-from nolbo_ppl.models.guide import Encoding
-from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import Encoding, RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import cell_of, decode_box
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors

@@ -18,8 +18,8 @@ from nolbo_ppl.inference.elbo import (
     PURE_BOUND,
     SceneELBO,
 )
-from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.scene_batch import unpack_bits
 from tests.bound_cases import FORMS, terms_of, unsymmetric
 from tests.factories import (

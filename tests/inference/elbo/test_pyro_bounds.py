@@ -10,8 +10,8 @@ from pyro import poutine
 from pyro.infer import Trace_ELBO, TraceEnum_ELBO, TraceMeanField_ELBO
 from torch import Tensor
 
-from nolbo_ppl.models.guide import ObservedScene
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observed_scene import ObservedScene
 from tests.bound_cases import FORMS, terms_of, unsymmetric
 from tests.factories import (
     assert_within,

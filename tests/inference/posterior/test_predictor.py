@@ -18,8 +18,8 @@ from nolbo_ppl.inference.posterior.decode import position_covariance
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.preprocess import prepare
 from nolbo_ppl.models.guide import orientation_posterior
-from nolbo_ppl.models.head import RegionParameters
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import cell_of, decode_box, decode_range
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes

@@ -1,0 +1,87 @@
+"""A batch of scenes as the guide observed it: what both the generative model and the guide are run on.
+
+The generative model reads labels and responsible regions alone; encoding and posterior are the guide's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nolbo_ppl.models.scene_batch import Assignment, SceneBatch
+
+
+@dataclass
+class Encoding:
+    """What the encoder made of a batch of images."""
+
+    features: Float[Tensor, "b cells c"]
+    """Features of each cell."""
+    objectness_logit: Float[Tensor, "b k"]
+    """Log odds of q(o | I) of every region; region = cell * predictors + predictor."""
+    rows: int
+    columns: int
+    fine: tuple[Float[Tensor, "b _ _ _"], ...] = ()
+    """Finer maps of the encoder, for the second look at each object."""
+
+
+@dataclass
+class RegionParameters:
+    """Parameters of q(. | I) of regions, any batch shape; latent units where not said otherwise."""
+
+    label_logits: Float[Tensor, "*n labels"]
+    """Log probabilities, up to a constant, of the category."""
+    shape_loc: Float[Tensor, "*n d"]
+    """Mean of the shape latent."""
+    shape_scale: Float[Tensor, "*n d"]
+    """Scale of the shape latent."""
+    azimuth_logits: Float[Tensor, "*n modes"]
+    """Log weights, up to a constant, of the azimuth's modes."""
+    azimuth_natural: Float[Tensor, "*n modes 2"]
+    """Natural parameters kappa (cos, sin) of each mode."""
+    angle_loc: Float[Tensor, "*n 2"]
+    """Mean elevation and in-plane rotation, rad."""
+    angle_scale: Float[Tensor, "*n 2"]
+    """Their scales, rad."""
+    box_loc: Float[Tensor, "*n 4"]
+    """Mean of the box latent."""
+    box_scale: Float[Tensor, "*n 4"]
+    """Scale of the box latent."""
+    range_loc: Float[Tensor, "*n 4"]
+    """Mean of the range latent."""
+    range_scale: Float[Tensor, "*n 4"]
+    """Scale of the range latent."""
+
+    def at_mode(self, prior_mean: Float[Tensor, "labels d"]) -> RegionParameters:
+        """The same with the shape latent's mean where the likeliest category puts it.
+
+        The guide's one Gaussian lies between categories it hesitates about (`RegionHead.parameters_of`), where no shape is:
+        its mean there decodes to neither. Answers take the mean of the likeliest category's part; the scale, which spans
+        them all, stays.
+
+        Args:
+            prior_mean: mean latent of each category.
+        """
+        probability = torch.softmax(self.label_logits, -1)
+        likeliest = torch.nn.functional.one_hot(probability.argmax(-1), probability.shape[-1])
+        shift = (likeliest - probability) @ prior_mean.to(probability.dtype)
+        return dataclasses.replace(self, shape_loc=self.shape_loc + shift)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> RegionParameters:
+        """Apply a function to every tensor."""
+        return RegionParameters(**{f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self)})
+
+
+@dataclass
+class ObservedScene:
+    """A batch with its encoding, its responsible regions and their posterior: what generative model and guide are run on."""
+
+    batch: SceneBatch
+    encoding: Encoding
+    assignment: Assignment
+    posterior: RegionParameters
