@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # One thread a process: torch's OpenMP threads spin and slow each other down on busy or small machines.
 TEST_WORKERS ?= 2
 
-.PHONY: setup demo train test lint bench docs clean
+.PHONY: setup demo train test lint wheel bench bench-gate docs clean
 
 setup: $(STAMP)
 
@@ -27,11 +27,26 @@ test: $(STAMP)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet .
 	$(BIN)/mypy
+
+# The built wheel in an environment that has nothing else: what a user gets who never sees this folder.
+wheel: $(STAMP)
+	rm -rf dist build/bare
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	$(PYTHON) -m venv build/bare
+	build/bare/bin/python -m pip install --quiet -c constraints.txt dist/*.whl
+	cd build && bare/bin/nolbo simulate --out bare/world --frames 40 --laps 1 --radius 15 --world.objects 12
+	cd build && bare/bin/nolbo slam --odometry bare/world/odometry.txt --observations bare/world/observations.jsonl \
+		--truth bare/world/truth.txt --out bare/map
+	test -s build/bare/map/summary.json
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/observation.py --out build/observation.json
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/association.py --out build/association.json
+
+bench-gate: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/gate.py
 
 docs: $(STAMP)
 	OMP_NUM_THREADS=1 NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -17,6 +17,7 @@ VERBS = {
     "evaluate": "measure a model on unseen scenes",
     "observe": "posteriors of the objects in a folder of images",
     "convert": "bring real data into the formats of slam and evaluate",
+    "simulate": "write a simulated world for slam: odometry, detections, truth",
     "slam": "correct a trajectory and map objects, from odometry and observations",
     "drive": "write a drive through a generated world: images, poses, objects",
     "odometry": "visual odometry of an image sequence",

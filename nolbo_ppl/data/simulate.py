@@ -57,6 +57,10 @@ class DetectorConfig:
     """Standard deviation of each latent coordinate."""
     objectness: tuple[float, float] = (0.9, 0.3)
     """Mean reported objectness of true and of false detections."""
+    confused_objects: float = 0.0
+    """Share of the objects that the detector takes for one other category, each for one of its own."""
+    confusion_rate: float = 0.7
+    """Probability of that mistake in a view of such an object: looks of one network at one object are not independent."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +195,7 @@ def simulate_detections(
         any_latent = world.category_latent[kind] + spread * rng.standard_normal((n, world.latent.shape[1]))
         latent = np.where(true[:, None], world.latent[source], any_latent)
         latent = latent + config.latent_scale * rng.standard_normal(latent.shape)
-        category = [f"c{k}" for k in kind]
+        category = [f"c{k}" for k in confused(kind, source, world, config, rng)]
     mean = np.where(true, config.objectness[0], config.objectness[1])
     objectness = rng.beta(10 * mean, 10 * (1 - mean)) if n else np.zeros(0)
     table = make_table(
@@ -207,6 +211,24 @@ def simulate_detections(
         id=[f"{t:06d}-{k:06d}" for k, t in enumerate(frame)],
     )
     return table, source
+
+
+def confused(
+    kind: Int[np.ndarray, " n"],
+    source: Int[np.ndarray, " n"],
+    world: SimulatedWorld,
+    config: DetectorConfig,
+    rng: np.random.Generator,
+) -> Int[np.ndarray, " n"]:
+    """Reported category of each detection: some objects are taken for one and the same other category again and again."""
+    categories = len(world.category_latent)
+    if config.confused_objects == 0.0 or categories < 2:
+        return kind  # draws nothing, so that worlds without confusions stay what they were
+    objects = len(world.category)
+    other = (world.category + rng.integers(1, categories, objects)) % categories
+    prone = rng.random(objects) < config.confused_objects
+    mistaken = (source >= 0) & prone[source] & (rng.random(len(source)) < config.confusion_rate)
+    return np.where(mistaken, other[source], kind)
 
 
 def simulate_drive(
