@@ -108,6 +108,13 @@ source, shipped = SceneSource(preset("easy"), seed=5), nolbo_ppl.load("tiny")
 image = next(image for image in (source.render(i).image for i in range(50)) if len(shipped.observe(image, decode=False)))
 Path("scenes/images").mkdir(parents=True)
 Image.fromarray(image).save("scenes/images/000000.png")
+import numpy as np
+from nolbo_ppl.geometry.pose import make_pose
+from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
+Path("drive/images").mkdir(parents=True)
+for frame in range(12):  # the camera stands still
+    Image.fromarray(image).save(f"drive/images/{frame:06d}.png")
+write_trajectory("drive/odometry.txt", Trajectory(make_pose(np.tile(np.eye(3), (12, 1, 1)), np.zeros((12, 3)))))
 """
 DRIVE = """
 import numpy as np
@@ -117,6 +124,8 @@ drive = simulate_drive(simulate_circuit(rng, laps=2, frames_per_lap=40), rng, wo
 odometry, seen = drive.odometry, drive.observations
 frame, position, R_camera_object, latent, names = seen.frame, seen.position, seen.rotation, seen.latent, seen.category
 """
+FOUND = {"README.md": "assert len(result.landmarks) >= 1 and len(detections) >= 12"}
+"""What the blocks of a page have made when they have run."""
 GIVEN = {"README.md": SEEN, "docs/bound.md": SCENES, "docs/slam.md": DRIVE}
 """What a page takes for granted: a folder of scenes, an image with an object the shipped weights see, or a user's own arrays."""
 WITH_PYTHON = [page for page in PAGES if any(blocks(page, "python"))]
@@ -130,6 +139,7 @@ def test_python_blocks_run_in_order(page: Path, tmp_path: Path) -> None:
         compile(text, str(page), "exec")
         if not any(mark in text for mark in LONG):
             code.append(text)
+    code.append(FOUND.get(page.relative_to(ROOT).as_posix(), ""))
     (tmp_path / "block.py").write_text("\n".join(code), encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-W", "error::SyntaxWarning", "block.py"], cwd=tmp_path, capture_output=True, text=True, timeout=600

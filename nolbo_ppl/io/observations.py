@@ -1,10 +1,12 @@
-"""Observations of objects as SLAM takes them: one table, read from and written to JSON Lines, checked field by field.
+"""Files of observations: `Detections` read from and written to JSON Lines, checked field by field.
 
 One detection a line: `frame` (row of the odometry, from 0) and `position` [x, y, z] m in the camera frame; optional
 `position_std` (a number or 3) or `position_cov` (3x3), `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
 `rotation_modes` (a list of `weight`, `rotation`, `std`: all modes of the orientation), `latent` [d], `latent_std` (a number
 or d), `objectness` (default 1), `category`, `size` [3] m, `symmetry` (1 none, n n-fold, 0 free about the object's vertical
-axis), `id` (carried through). What is missing is NaN in the table.
+axis), `id`. A model's own lines say more, which SLAM does not use and every reader keeps: `image`, `time` s, `box`
+[x0, y0, x1, y1] px, `class_posterior` (probability by category), `viewpoint` [azimuth, elevation, in-plane] rad,
+`azimuth_modes` (a list of `weight`, `azimuth`, `concentration`).
 """
 
 from __future__ import annotations
@@ -17,17 +19,37 @@ import numpy as np
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.pose import matrix_to_quaternion, quaternion_to_matrix
+from nolbo_ppl.geometry.pose import quaternion_to_matrix
 from nolbo_ppl.io.files import read_jsonl, write_jsonl
-from nolbo_ppl.structures.detections import (
-    ARRAYS,
-    MAXIMUM_DISTANCE,
-    Detections,
-    check_table,
-    concatenate,
-    heaviest_mode,
-    make_table,
+from nolbo_ppl.structures.detection_checks import MAX_POSITION, check_table
+from nolbo_ppl.structures.detection_records import to_records
+from nolbo_ppl.structures.detections import ARRAYS, Detections, concatenate, heaviest_mode, make_table, merged_order, padding
+
+FIELDS = (
+    "frame",
+    "image",
+    "time",
+    "id",
+    "box",
+    "objectness",
+    "category",
+    "class_posterior",
+    "position",
+    "position_std",
+    "position_cov",
+    "rotation",
+    "rotation_std",
+    "rotation_modes",
+    "viewpoint",
+    "azimuth_modes",
+    "latent",
+    "latent_std",
+    "size",
+    "symmetry",
 )
+"""Fields a line may have."""
+WEIGHT_ROUNDING = 1e-4
+"""Weights that sum to one within this are taken as they are: a file rounds them."""
 
 
 def _vector(row: dict[str, Any], key: str, length: int | None, where: dict[str, Any]) -> np.ndarray:
@@ -49,27 +71,6 @@ def _scale(row: dict[str, Any], key: str, length: int, where: dict[str, Any]) ->
     if not (np.isfinite(vector).all() and (vector > 0).all()):
         raise input_error(f"`{key}` is no standard deviation", got=value, expected="greater than 0", **where)
     return vector
-
-
-CARRIED = frozenset({"image", "box", "class_posterior", "viewpoint", "azimuth_modes"})
-"""Fields of the observation model's own lines that say more than SLAM uses; they are accepted and left aside."""
-
-_KNOWN = {
-    "frame",
-    "position",
-    "position_std",
-    "position_cov",
-    "rotation",
-    "rotation_std",
-    "rotation_modes",
-    "latent",
-    "latent_std",
-    "objectness",
-    "category",
-    "size",
-    "symmetry",
-    "id",
-}
 
 
 def _rotation(row: dict[str, Any], where: dict[str, Any], name: str = "rotation") -> np.ndarray:
@@ -109,10 +110,63 @@ def _modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
     if not abs(total - 1) < 1e-2:
         raise input_error("weights of `rotation_modes` do not sum to one", got=total, expected="1", **where)
     return {
-        "mode_weight": np.array(weight) / total,
+        "mode_weight": np.array(weight) / (1.0 if abs(total - 1) <= WEIGHT_ROUNDING else total),
         "mode_rotation": np.stack([_rotation(mode, where, "rotation_modes") for mode in value]),
         "mode_std": np.concatenate([_scale(mode, "std", 1, where) for mode in value]),
     }
+
+
+def _number(value: Any, low: float, high: float, what: str, where: dict[str, Any]) -> float:
+    """A number in a range."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or not np.isfinite(value):
+        raise input_error(what, got=value, expected=f"{low:g} to {high:g}", **where)
+    return float(value)
+
+
+def _azimuth_modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The von Mises modes of an azimuth, as they are stated."""
+    names = {"weight": (0.0, np.inf), "azimuth": (-np.inf, np.inf), "concentration": (0.0, np.inf)}
+    if not isinstance(value, list) or not all(isinstance(mode, dict) and set(mode) == set(names) for mode in value):
+        expected = '[{"weight": w, "azimuth": rad, "concentration": k}, ...]'
+        raise input_error("`azimuth_modes` is no list of modes", got=value, expected=expected, **where)
+    columns = {
+        name: np.array([_number(mode[name], *limits, f"`azimuth_modes`: `{name}` is out of range", where) for mode in value])
+        for name, limits in names.items()
+    }
+    return {
+        "azimuth_weight": columns["weight"],
+        "azimuth": columns["azimuth"],
+        "azimuth_concentration": columns["concentration"],
+    }
+
+
+def _image_fields(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
+    """What a line says of the image and of the model's whole answer."""
+    out: dict[str, Any] = {}
+    if row.get("image") is not None:
+        if not isinstance(row["image"], str):
+            raise input_error("`image` is no name", got=row["image"], expected="a string", **where)
+        out["image"] = row["image"]
+    if row.get("time") is not None:
+        out["time"] = _number(row["time"], -np.inf, np.inf, "`time` is no number of seconds", where)
+    if row.get("box") is not None:
+        out["box"] = box = _vector(row, "box", 4, where)
+        if (box[2:] < box[:2]).any():
+            raise input_error(
+                "`box` is turned inside out", got=row["box"], expected="[x0, y0, x1, y1], x0 <= x1, y0 <= y1", **where
+            )
+    if row.get("class_posterior") is not None:
+        posterior = row["class_posterior"]
+        if not isinstance(posterior, dict):
+            raise input_error("`class_posterior` is no probability by category", got=posterior, expected="{name: p}", **where)
+        out["class_posterior"] = {
+            name: _number(p, 0.0, 1.0, f"`class_posterior`: {name!r} is no probability", where) for name, p in posterior.items()
+        }
+    if row.get("viewpoint") is not None:
+        out["viewpoint"] = _vector(row, "viewpoint", 3, where)
+    if row.get("azimuth_modes") is not None:
+        out.update(_azimuth_modes(row["azimuth_modes"], where))
+    return out
 
 
 def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
@@ -124,8 +178,8 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     if isinstance(frame, bool) or not isinstance(frame, int) or frame < 0:
         raise input_error("`frame` is no row number", got=frame, expected="an integer from 0", **where)
     out: dict[str, Any] = {"frame": frame, "position": _vector(row, "position", 3, where)}
-    if np.abs(out["position"]).max() > MAXIMUM_DISTANCE:
-        raise input_error("`position` out of range", got=row["position"], expected=f"within {MAXIMUM_DISTANCE:g} m", **where)
+    if np.abs(out["position"]).max() > MAX_POSITION:
+        raise input_error("`position` out of range", got=row["position"], expected=f"within {MAX_POSITION:g} m", **where)
     if row.get("position_cov") is not None:
         try:
             covariance = np.asarray(row["position_cov"], dtype=np.float64)
@@ -172,11 +226,18 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     if symmetry is not None and (isinstance(symmetry, bool) or not isinstance(symmetry, int) or symmetry < 0):
         raise input_error("`symmetry` is no order", got=symmetry, expected="1 none, n n-fold, 0 free", **where)
     out["symmetry"] = -1 if symmetry is None else symmetry
+    out.update(_image_fields(row, where))
     return out
 
 
 def read_observations(path: str | PathLike[str], frames: int | None = None) -> Detections:
-    """Read observations from JSON Lines.
+    """Read detections from JSON Lines: every field of a line is kept, and `write_observations` writes it again.
+
+    >>> from tempfile import mkdtemp
+    >>> path = mkdtemp() + "/observations.jsonl"
+    >>> write_observations(path, Detections.from_arrays([0, 4], [[0, 0, 5.0], [1, 0, 8]], category=["car", None]))
+    >>> read_observations(path, frames=5).category
+    ('car', None)
 
     Args:
         path: the file.
@@ -192,9 +253,9 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> D
     dimension: int | None = None
     for number, row in read_jsonl(path):
         where: dict[str, Any] = {"file": path, "line": number}
-        unknown = set(row) - _KNOWN - CARRIED
+        unknown = set(row) - set(FIELDS)
         if unknown:
-            raise input_error("unknown field", got=sorted(unknown), expected=f"some of {sorted(_KNOWN)}", **where)
+            raise input_error("unknown field", got=sorted(unknown), expected=f"some of {sorted(FIELDS)}", **where)
         values = _parse(row, where)
         if frames is not None and values["frame"] >= frames:
             raise input_error(
@@ -210,92 +271,73 @@ def read_observations(path: str | PathLike[str], frames: int | None = None) -> D
         ids[identity] = number
         values["id"] = identity
         rows.append(values)
-    d = dimension or 0
-    K = max((len(row["mode_weight"]) for row in rows if "mode_weight" in row), default=0)
-    missing = {
-        "position_covariance": np.full((3, 3), np.nan),
-        "rotation": np.full((3, 3), np.nan),
-        "rotation_scale": np.nan,
-        "latent": np.full(d, np.nan),
-        "latent_scale": np.full(d, np.nan),
-        "size": np.full(3, np.nan),
-    }
-    padding = {"mode_weight": np.zeros(K), "mode_rotation": np.tile(np.eye(3), (K, 1, 1)), "mode_std": np.ones(K)}
+    return _table(rows)
+
+
+def _table(rows: list[dict[str, Any]]) -> Detections:
+    """Parsed lines as one table."""
+
+    def longest(name: str) -> int:
+        return max((len(row[name]) for row in rows if name in row), default=0)
+
+    latent, modes, azimuths = longest("latent"), longest("mode_weight"), longest("azimuth")
+    names = merged_order(tuple(row["class_posterior"]) for row in rows if "class_posterior" in row)
+    for row in rows:
+        if "class_posterior" in row:
+            row["class_posterior"] = np.array([row["class_posterior"].get(name, np.nan) for name in names])
     shapes = {
         "position": (3,),
         "position_covariance": (3, 3),
         "rotation": (3, 3),
-        "latent": (d,),
-        "latent_scale": (d,),
+        "latent": (latent,),
+        "latent_scale": (latent,),
         "size": (3,),
-        "mode_weight": (K,),
-        "mode_rotation": (K, 3, 3),
-        "mode_std": (K,),
+        "mode_weight": (modes,),
+        "mode_rotation": (modes, 3, 3),
+        "mode_std": (modes,),
+        "box": (4,),
+        "class_posterior": (len(names),),
+        "viewpoint": (3,),
+        "azimuth_weight": (azimuths,),
+        "azimuth": (azimuths,),
+        "azimuth_concentration": (azimuths,),
     }
 
     def column(name: str) -> np.ndarray:
-        if name in padding:  # rows with fewer modes are padded
-            values = [
-                np.concatenate([row[name], padding[name][len(row[name]) :]]) if name in row else padding[name] for row in rows
-            ]
-        else:
-            values = [row.get(name, missing.get(name)) for row in rows]
-        dtype = np.int64 if name in ("frame", "symmetry") else np.float64
-        return np.array(values, dtype=dtype).reshape(len(rows), *shapes.get(name, ()))
+        shape = (len(rows), *shapes.get(name, ()))
+        values = padding(name, shape)
+        for i, row in enumerate(rows):
+            if name in row:
+                values[(i, slice(len(row[name]))) if len(shape) > 1 else i] = row[name]
+        return values.astype(np.int64) if name in ("frame", "symmetry") else values
 
     return Detections(
         **{name: column(name) for name in ARRAYS},
         category=tuple(row["category"] for row in rows),
         id=tuple(row["id"] for row in rows),
+        image=tuple(row.get("image") for row in rows),
+        class_names=names,
     )
 
 
-def write_observations(path: str | PathLike[str], table: Detections) -> None:
-    """Write a table as JSON Lines, atomically; missing fields are left out."""
-    write_jsonl(path, (observation_row(table, i) for i in range(len(table))))
+def write_observations(path: str | PathLike[str], detections: Detections) -> None:
+    """Write detections as JSON Lines, atomically; missing fields are left out.
+
+    Numbers are written with all their digits, rotations as quaternions of eight decimals: what `read_observations` has read is
+    written as the same lines again.
+
+    >>> from tempfile import mkdtemp
+    >>> path = mkdtemp() + "/observations.jsonl"
+    >>> write_observations(path, Detections.from_arrays([7], [[0, 0, 5.0]], category=["car"]))
+    >>> print(open(path).read().strip())
+    {"frame": 7, "id": "0", "objectness": 1.0, "category": "car", "position": [0.0, 0.0, 5.0]}
+    """
+    write_jsonl(path, to_records(detections))
 
 
 def observation_row(table: Detections, i: int) -> dict[str, Any]:
     """One row of a table in the form of the file."""
-    row: dict[str, Any] = {"frame": int(table.frame[i]), "position": _rounded(table.position[i])}
-    covariance = table.position_covariance[i]
-    if np.isfinite(covariance).all():
-        if np.array_equal(covariance, np.diag(np.diag(covariance))):
-            row["position_std"] = _rounded(np.sqrt(np.diag(covariance)))
-        else:
-            row["position_cov"] = [_rounded(r, 9) for r in covariance]
-    if np.isfinite(table.rotation[i]).all():
-        row["rotation"] = _rounded(matrix_to_quaternion(table.rotation[i]), 8)
-    if np.isfinite(table.rotation_scale[i]):
-        row["rotation_std"] = float(table.rotation_scale[i])
-    used = np.flatnonzero(table.mode_weight[i] > 0)
-    if len(used):
-        row["rotation_modes"] = [
-            {
-                "weight": float(table.mode_weight[i, k]),
-                "rotation": _rounded(matrix_to_quaternion(table.mode_rotation[i, k]), 8),
-                "std": float(table.mode_std[i, k]),
-            }
-            for k in used
-        ]
-    if table.latent_dim and np.isfinite(table.latent[i]).all():
-        row["latent"] = _rounded(table.latent[i])
-        if np.isfinite(table.latent_scale[i]).all():
-            row["latent_std"] = _rounded(table.latent_scale[i])
-    if table.objectness[i] != 1.0:
-        row["objectness"] = float(table.objectness[i])
-    if table.category[i] is not None:
-        row["category"] = table.category[i]
-    if np.isfinite(table.size[i]).all():
-        row["size"] = _rounded(table.size[i])
-    if table.symmetry[i] >= 0:
-        row["symmetry"] = int(table.symmetry[i])
-    row["id"] = table.id[i]
-    return row
-
-
-def _rounded(values: np.ndarray, digits: int = 6) -> list[float]:
-    return [float(f"{v:.{digits + 1}g}") for v in values]
+    return next(to_records(table.select(np.array([i]))))
 
 
 __all__ = [
@@ -303,7 +345,6 @@ __all__ = [
     "check_table",
     "concatenate",
     "make_table",
-    "observation_row",
     "read_observations",
     "write_observations",
 ]

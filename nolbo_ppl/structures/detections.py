@@ -1,9 +1,11 @@
-"""Observations of objects as SLAM takes them: one table of arrays, NaN where a field is missing, checked before use."""
+"""Detections of objects as SLAM takes them: one table of arrays, NaN where a field is missing."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,13 +14,23 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 
-MAXIMUM_DISTANCE = 1e5
-"""Positions farther than this from the camera, in m, are refused as malformed."""
+NOT_STATED: Any = None
+"""A field that nobody stated: it is filled with missing values when the table is made."""
 
 
 @dataclass(frozen=True)
 class Detections:
-    """Detections of objects in camera frames; NaN where a field is missing. Rows keep the order of the file."""
+    """Detections of objects in camera frames, a row each; what is missing is NaN, -1 or None.
+
+    What `SlamProblem` takes and what a file of observations holds (`nolbo_ppl.read_observations`); made from a model's answer
+    by `ObjectPosteriors.detections`, from arrays of your own by `Detections.from_arrays`.
+
+    >>> seen = Detections.from_arrays([0, 0, 1], [[0, 0, 5.0], [2, 0, 9], [0, 0, 4]], category=["car", "bus", "car"])
+    >>> len(seen), seen.select(seen.frame == 0).category
+    (3, ('car', 'bus'))
+    >>> seen.has_rotation.any()
+    np.False_
+    """
 
     frame: Int[np.ndarray, " n"]
     """Row of the odometry, from 0."""
@@ -44,18 +56,38 @@ class Detections:
     """Order of the symmetry about the object's vertical axis (0 free); -1: that of the category."""
     id: tuple[str, ...]
     """Identifiers; the row number where the file had none."""
-    mode_weight: Float[np.ndarray, "n K"] = field(default_factory=lambda: np.zeros((0, 0)))
+    mode_weight: Float[np.ndarray, "n K"] = NOT_STATED
     """Weights of the modes of the orientation, 0 where there are fewer; K is 0 when nobody states any."""
-    mode_rotation: Float[np.ndarray, "n K 3 3"] = field(default_factory=lambda: np.zeros((0, 0, 3, 3)))
+    mode_rotation: Float[np.ndarray, "n K 3 3"] = NOT_STATED
     """R_camera_object of every mode, the identity where there are fewer."""
-    mode_std: Float[np.ndarray, "n K"] = field(default_factory=lambda: np.ones((0, 0)))
+    mode_std: Float[np.ndarray, "n K"] = NOT_STATED
     """Standard deviation of each angle of every mode, rad; 1 where there are fewer."""
+    image: tuple[str | None, ...] = ()
+    """Name of the image it was seen in, or None."""
+    time: Float[np.ndarray, " n"] = NOT_STATED
+    """Time of that image, s; NaN where missing."""
+    box: Float[np.ndarray, "n 4"] = NOT_STATED
+    """Box [x0, y0, x1, y1] in that image, px; NaN where missing."""
+    class_names: tuple[str, ...] = ()
+    """Categories of the columns of `class_posterior`, in an order that agrees with every row's."""
+    class_posterior: Float[np.ndarray, "n c"] = NOT_STATED
+    """Probability of each of `class_names`; NaN where a row does not state it."""
+    viewpoint: Float[np.ndarray, "n 3"] = NOT_STATED
+    """(azimuth, elevation, in-plane rotation), allocentric, rad; NaN where missing."""
+    azimuth_weight: Float[np.ndarray, "n M"] = NOT_STATED
+    """Weights of the von Mises modes of the azimuth; NaN where there are fewer."""
+    azimuth: Float[np.ndarray, "n M"] = NOT_STATED
+    """Their mean directions, allocentric, rad."""
+    azimuth_concentration: Float[np.ndarray, "n M"] = NOT_STATED
+    """Their concentrations."""
 
     def __post_init__(self) -> None:
-        if len(self.mode_weight) != len(self.frame) and not self.mode_weight.shape[1]:  # a table without modes
-            object.__setattr__(self, "mode_weight", np.zeros((len(self.frame), 0)))
-            object.__setattr__(self, "mode_rotation", np.zeros((len(self.frame), 0, 3, 3)))
-            object.__setattr__(self, "mode_std", np.ones((len(self.frame), 0)))
+        n = len(self.frame)
+        if len(self.image) != n and not self.image:
+            object.__setattr__(self, "image", (None,) * n)
+        for name, columns in OPTIONAL.items():
+            if getattr(self, name) is NOT_STATED:
+                object.__setattr__(self, name, padding(name, (n, *columns)))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -80,116 +112,197 @@ class Detections:
         """Rows with a latent."""
         return np.isfinite(self.latent).all(axis=1) & (self.latent_dim > 0)
 
+    @property
+    def has_box(self) -> Bool[np.ndarray, " n"]:
+        """Rows with a box in the image."""
+        return np.isfinite(self.box).all(axis=1)
+
     def select(self, rows: np.ndarray) -> Detections:
         """The given rows (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]
-        return replace(
-            self,
-            **{name: getattr(self, name)[index] for name in ARRAYS},
-            category=tuple(self.category[i] for i in index),
-            id=tuple(self.id[i] for i in index),
+        chosen: dict[str, Any] = {name: getattr(self, name)[index] for name in ARRAYS}
+        chosen |= {name: tuple(getattr(self, name)[i] for i in index) for name in TEXTS}
+        return replace(self, **chosen)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        frame: Any,
+        position: Any,
+        *,
+        position_covariance: Any = None,
+        position_scale: Any = None,
+        rotation: Any = None,
+        rotation_scale: Any = None,
+        latent: Any = None,
+        latent_scale: Any = None,
+        objectness: Any = None,
+        category: Iterable[str | None] | None = None,
+        size: Any = None,
+        symmetry: Any = None,
+        id: Iterable[str] | None = None,
+        mode_weight: Any = None,
+        mode_rotation: Any = None,
+        mode_std: Any = None,
+        image: Iterable[str | None] | None = None,
+        time: Any = None,
+        box: Any = None,
+    ) -> Detections:
+        """Build a table from arrays; everything but frame and position is optional, scalars are broadcast.
+
+        Args:
+            frame: [n] rows of the odometry.
+            position: [n, 3] m in the camera frame.
+            position_covariance: [n, 3, 3] m^2, or `position_scale` [n, 3], [n] or a number in m.
+            rotation: [n, 3, 3] R_camera_object.
+            latent: [n, d]; `latent_scale` [n, d], [n] or a number.
+            mode_weight: [n, K] weights of the orientation's modes (0: no such mode), with `mode_rotation` [n, K, 3, 3] and
+                `mode_std` [n, K] or a number in rad; where `rotation` is not given it is the heaviest mode.
+            image: [n] names of images, with `time` [n] s and `box` [n, 4] px.
+
+        Raises:
+            InputError: shapes do not match.
+        """
+        frame = np.asarray(frame, dtype=np.int64).reshape(-1)
+        n = len(frame)
+        count = 0 if mode_weight is None else np.asarray(mode_weight).shape[-1]
+        if count and (mode_rotation is None or mode_std is None):
+            raise input_error("modes of the orientation are incomplete", expected="mode_weight, mode_rotation and mode_std")
+
+        def full(value: Any, shape: tuple[int, ...], name: str, default: float = np.nan) -> np.ndarray:
+            if value is None:
+                return np.full(shape, default)
+            array = np.asarray(value, dtype=np.float64)
+            if array.ndim == 1 and len(shape) == 2 and len(array) == n:
+                array = array[:, None]
+            try:
+                return np.array(np.broadcast_to(array, shape))
+            except ValueError:
+                raise input_error(f"{name} has the wrong shape", got=array.shape, expected=shape) from None
+
+        dimension = 0 if latent is None else np.asarray(latent).shape[-1]
+        if position_covariance is None and position_scale is not None:
+            scale = full(position_scale, (n, 3), "position_scale")
+            position_covariance = scale[:, :, None] ** 2 * np.eye(3)
+        modes: dict[str, Any] = {}
+        if count:
+            modes = {
+                "mode_weight": full(mode_weight, (n, count), "mode_weight"),
+                "mode_rotation": full(mode_rotation, (n, count, 3, 3), "mode_rotation"),
+                "mode_std": full(mode_std, (n, count), "mode_std"),
+            }
+            if rotation is None:
+                rotation, rotation_scale = heaviest_mode(**modes)
+        texts: dict[str, Any] = {
+            "category": tuple(category) if category is not None else (None,) * n,
+            "id": tuple(id) if id is not None else tuple(str(i) for i in range(n)),
+            "image": tuple(image) if image is not None else (None,) * n,
+        }
+        for name, values in texts.items():
+            if len(values) != n:
+                raise input_error(f"{name} has the wrong length", got=len(values), expected=n)
+        return cls(
+            frame=frame,
+            position=full(position, (n, 3), "position").reshape(n, 3),
+            position_covariance=full(position_covariance, (n, 3, 3), "position_covariance"),
+            rotation=full(rotation, (n, 3, 3), "rotation"),
+            rotation_scale=full(rotation_scale, (n,), "rotation_scale"),
+            latent=full(latent, (n, dimension), "latent"),
+            latent_scale=full(latent_scale, (n, dimension), "latent_scale"),
+            objectness=full(objectness, (n,), "objectness", default=1.0),
+            size=full(size, (n, 3), "size"),
+            symmetry=full(symmetry, (n,), "symmetry", default=-1.0).astype(np.int64),
+            time=full(time, (n,), "time"),
+            box=full(box, (n, 4), "box"),
+            **texts,
+            **modes,
         )
 
+    @classmethod
+    def concatenate(cls, tables: Sequence[Detections]) -> Detections:
+        """Stack tables: those without latents get rows of NaN, those with fewer modes or categories room for more.
 
-ARRAYS = (
-    "frame",
-    "position",
-    "position_covariance",
-    "rotation",
-    "rotation_scale",
-    "latent",
-    "latent_scale",
-    "objectness",
-    "size",
-    "symmetry",
-    "mode_weight",
-    "mode_rotation",
-    "mode_std",
-)
+        >>> one = Detections.from_arrays([0], [[0, 0, 5.0]], latent=[[1.0, 2.0]], id=["a"])
+        >>> two = Detections.from_arrays([1], [[0, 0, 4.0]], id=["b"])
+        >>> Detections.concatenate([one, two]).latent
+        array([[ 1.,  2.],
+               [nan, nan]])
+
+        Raises:
+            InputError: no tables, or latents of different lengths.
+        """
+        if not tables:
+            raise input_error("no tables to stack", expected="at least one")
+        dimensions = sorted({table.latent_dim for table in tables} - {0})
+        if len(dimensions) > 1:
+            raise input_error("latents of different lengths", got=dimensions, expected="one length")
+        names = merged_order([table.class_names for table in tables])
+        tables = [_in_columns(table, names) for table in tables]
+        joined: dict[str, Any] = {"class_names": names}
+        for name in ARRAYS:
+            values = [getattr(table, name) for table in tables]
+            width = max((value.shape[1:2] for value in values), default=())
+            joined[name] = np.concatenate([_widened(name, value, width) for value in values])
+        for name in TEXTS:
+            joined[name] = tuple(text for table in tables for text in getattr(table, name))
+        return cls(**joined)
 
 
-def make_table(
-    frame: Any,
-    position: Any,
-    *,
-    position_covariance: Any = None,
-    position_scale: Any = None,
-    rotation: Any = None,
-    rotation_scale: Any = None,
-    latent: Any = None,
-    latent_scale: Any = None,
-    objectness: Any = None,
-    category: Iterable[str | None] | None = None,
-    size: Any = None,
-    symmetry: Any = None,
-    id: Iterable[str] | None = None,
-    mode_weight: Any = None,
-    mode_rotation: Any = None,
-    mode_std: Any = None,
-) -> Detections:
-    """Build a table from numpy arrays; everything but frame and position is optional, scalars are broadcast.
+TEXTS = ("category", "id", "image")
+"""Fields with a text for each row."""
+ARRAYS = tuple(one.name for one in fields(Detections) if one.name not in (*TEXTS, "class_names"))
+"""Fields with a row of numbers for each row."""
+OPTIONAL: dict[str, tuple[int, ...]] = {
+    "mode_weight": (0,),
+    "mode_rotation": (0, 3, 3),
+    "mode_std": (0,),
+    "time": (),
+    "box": (4,),
+    "class_posterior": (0,),
+    "viewpoint": (3,),
+    "azimuth_weight": (0,),
+    "azimuth": (0,),
+    "azimuth_concentration": (0,),
+}
+"""Numbers that a table may be made without, and the shape of a row that nobody stated."""
 
-    Args:
-        frame: [n] rows of the odometry.
-        position: [n, 3] m in the camera frame.
-        position_covariance: [n, 3, 3] m^2, or `position_scale` [n, 3], [n] or a number in m.
-        rotation: [n, 3, 3] R_camera_object.
-        latent: [n, d]; `latent_scale` [n, d], [n] or a number.
-        mode_weight: [n, K] weights of the orientation's modes (0: no such mode), with `mode_rotation` [n, K, 3, 3] and
-            `mode_std` [n, K] or a number in rad; where `rotation` is not given it is the heaviest mode.
 
-    Raises:
-        InputError: shapes do not match.
-    """
-    frame = np.asarray(frame, dtype=np.int64).reshape(-1)
-    n = len(frame)
-    count = 0 if mode_weight is None else np.asarray(mode_weight).shape[-1]
-    if count and (mode_rotation is None or mode_std is None):
-        raise input_error("modes of the orientation are incomplete", expected="mode_weight, mode_rotation and mode_std")
+def padding(name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """What stands for a missing value of a field."""
+    if name == "mode_rotation":
+        return np.tile(np.eye(3), (*shape[:2], 1, 1))
+    return np.full(shape, {"mode_weight": 0.0, "mode_std": 1.0}.get(name, np.nan))
 
-    def full(value: Any, shape: tuple[int, ...], name: str, default: float = np.nan) -> np.ndarray:
-        if value is None:
-            return np.full(shape, default)
-        array = np.asarray(value, dtype=np.float64)
-        if array.ndim == 1 and len(shape) == 2 and len(array) == n:
-            array = array[:, None]
-        try:
-            return np.array(np.broadcast_to(array, shape))
-        except ValueError:
-            raise input_error(f"{name} has the wrong shape", got=array.shape, expected=shape) from None
 
-    dimension = 0 if latent is None else np.asarray(latent).shape[-1]
-    if position_covariance is None and position_scale is not None:
-        scale = full(position_scale, (n, 3), "position_scale")
-        position_covariance = scale[:, :, None] ** 2 * np.eye(3)
-    modes: dict[str, np.ndarray] = {}
-    if count:
-        modes = {
-            "mode_weight": full(mode_weight, (n, count), "mode_weight"),
-            "mode_rotation": full(mode_rotation, (n, count, 3, 3), "mode_rotation"),
-            "mode_std": full(mode_std, (n, count), "mode_std"),
-        }
-        if rotation is None:
-            rotation, rotation_scale = heaviest_mode(**modes)
-    categories = tuple(category) if category is not None else (None,) * n
-    ids = tuple(id) if id is not None else tuple(str(i) for i in range(n))
-    if len(categories) != n or len(ids) != n:
-        raise input_error("category or id has the wrong length", got=(len(categories), len(ids)), expected=n)
-    return Detections(
-        frame=frame,
-        position=full(position, (n, 3), "position").reshape(n, 3),
-        position_covariance=full(position_covariance, (n, 3, 3), "position_covariance"),
-        rotation=full(rotation, (n, 3, 3), "rotation"),
-        rotation_scale=full(rotation_scale, (n,), "rotation_scale"),
-        latent=full(latent, (n, dimension), "latent"),
-        latent_scale=full(latent_scale, (n, dimension), "latent_scale"),
-        objectness=full(objectness, (n,), "objectness", default=1.0),
-        category=categories,
-        size=full(size, (n, 3), "size"),
-        symmetry=full(symmetry, (n,), "symmetry", default=-1.0).astype(np.int64),
-        id=ids,
-        **modes,
-    )
+def _widened(name: str, value: np.ndarray, width: tuple[int, ...]) -> np.ndarray:
+    """A field with as many columns as `width` says, the new ones missing."""
+    if not width or value.shape[1] == width[0]:
+        return value
+    more = padding(name, (len(value), width[0] - value.shape[1], *value.shape[2:]))
+    return np.concatenate([value, more], axis=1)
+
+
+def _in_columns(table: Detections, names: tuple[str, ...]) -> Detections:
+    """The same table with its class posterior in the given columns."""
+    if table.class_names == names:
+        return table
+    posterior = np.full((len(table), len(names)), np.nan)
+    posterior[:, [names.index(name) for name in table.class_names]] = table.class_posterior
+    return replace(table, class_names=names, class_posterior=posterior)
+
+
+def merged_order(orders: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    """All names once, in an order that agrees with every given one; that of their first appearance where none does."""
+    different = list(dict.fromkeys(tuple(order) for order in orders))
+    names = tuple(dict.fromkeys(name for order in different for name in order))
+    before: dict[str, dict[str, None]] = {name: {} for name in names}  # no sets: their order would change from run to run
+    for order in different:
+        for earlier, later in pairwise(order):
+            before[later][earlier] = None
+    try:
+        return tuple(TopologicalSorter(before).static_order())
+    except CycleError:
+        return names
 
 
 def heaviest_mode(
@@ -201,88 +314,8 @@ def heaviest_mode(
     return (np.where(none[:, None, None], np.nan, mode_rotation[row, best]), np.where(none, np.nan, mode_std[row, best]))
 
 
-def with_modes(table: Detections, count: int) -> Detections:
-    """The same table with room for `count` modes an orientation."""
-    more = count - table.modes
-    if more <= 0:
-        return table
-    n = len(table)
-    return replace(
-        table,
-        mode_weight=np.concatenate([table.mode_weight, np.zeros((n, more))], axis=1),
-        mode_rotation=np.concatenate([table.mode_rotation, np.tile(np.eye(3), (n, more, 1, 1))], axis=1),
-        mode_std=np.concatenate([table.mode_std, np.ones((n, more))], axis=1),
-    )
-
-
-def concatenate(tables: list[Detections]) -> Detections:
-    """Stack tables of one latent dimension."""
-    count = max(table.modes for table in tables)
-    tables = [with_modes(table, count) for table in tables]
-    first = tables[0]
-    return replace(
-        first,
-        **{name: np.concatenate([getattr(t, name) for t in tables]) for name in ARRAYS},
-        category=sum((t.category for t in tables), ()),
-        id=sum((t.id for t in tables), ()),
-    )
-
-
-def check_table(table: Detections, frames: int) -> None:
-    """Refuse what no inference can use: the first bad row is named by its id.
-
-    Raises:
-        InputError: frames out of range, values not finite, covariances not positive definite, no rotations, scales not
-            positive, objectness outside [0, 1].
-    """
-
-    def refuse(bad: np.ndarray, what: str, values: np.ndarray, expected: str) -> None:
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise input_error(f"observation {table.id[row]!r} (row {row}): {what}", got=values[row], expected=expected)
-
-    refuse((table.frame < 0) | (table.frame >= frames), "frame out of range", table.frame, f"0 to {frames - 1}")
-    refuse(~np.isfinite(table.position).all(axis=1), "position is not finite", table.position, "3 finite numbers in m")
-    refuse(
-        np.abs(table.position).max(axis=1, initial=0) > MAXIMUM_DISTANCE,
-        "position out of range",
-        table.position,
-        f"within {MAXIMUM_DISTANCE:g} m",
-    )
-    given = ~np.isnan(table.position_covariance).all(axis=(1, 2))
-    covariance = np.where(given[:, None, None], table.position_covariance, np.eye(3))
-    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    refuse(~finite, "position covariance is not finite", covariance, "finite m^2")
-    symmetric = np.abs(covariance - np.swapaxes(covariance, 1, 2)).max(axis=(1, 2), initial=0) <= 1e-6 * np.abs(covariance).max(
-        axis=(1, 2), initial=0
-    )
-    refuse(~symmetric, "position covariance is not symmetric", covariance, "a symmetric matrix")
-    eigenvalues = np.linalg.eigvalsh(covariance) if len(covariance) else np.ones((0, 3))
-    refuse(
-        eigenvalues[:, 0] <= 1e-12 * np.maximum(eigenvalues[:, 2], 1e-300),
-        "position covariance is not positive definite",
-        covariance,
-        "positive eigenvalues",
-    )
-    rotation = np.where(table.has_rotation[:, None, None], table.rotation, np.eye(3))
-    residual = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2), initial=0)
-    refuse(~(residual < 1e-3) | (np.linalg.det(rotation) < 0), "rotation is no rotation", rotation, "orthonormal")
-    for name in ("rotation_scale", "latent_scale"):
-        scale = getattr(table, name).reshape(len(table), -1 if len(table) else 0)
-        bad = ((scale <= 0) | np.isinf(scale)).any(axis=1)
-        refuse(bad, f"{name} is not a positive number", scale, "greater than 0")
-    weight = table.mode_weight
-    refuse(~(np.isfinite(weight) & (weight >= 0)).all(axis=1), "mode_weight is no weight", weight, "0 or more")
-    stated = weight.sum(axis=1) > 0
-    refuse(stated & ~table.has_rotation, "modes without a rotation", weight, "`rotation`, the best mode, as well")
-    turned = table.mode_rotation
-    residual = np.abs(np.swapaxes(turned, 2, 3) @ turned - np.eye(3)).max(axis=(1, 2, 3), initial=0)
-    mirrored = (np.linalg.det(turned) < 0).any(axis=1)
-    refuse(~(residual < 1e-3) | mirrored, "mode_rotation is no rotation", turned, "orthonormal")
-    bad = (~(table.mode_std > 0) | np.isinf(table.mode_std)).any(axis=1)
-    refuse(bad, "mode_std is not a positive number", table.mode_std, "greater than 0")
-    refuse(np.isinf(table.latent).any(axis=1), "latent is not finite", table.latent, "finite numbers")
-    refuse(~((table.objectness >= 0) & (table.objectness <= 1)), "objectness is no probability", table.objectness, "0 to 1")
+make_table = Detections.from_arrays
+concatenate = Detections.concatenate
 
 
 __getattr__ = renamed(__name__, {"ObservationTable": "Detections"})

@@ -11,12 +11,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl._moved import renamed
+from nolbo_ppl.geometry.pose import quaternion_to_matrix
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
+from nolbo_ppl.structures.detection_records import rounded_quaternion, significant, to_records
+from nolbo_ppl.structures.detections import Detections
 
-LEAST_CONCENTRATION = 0.1
+MIN_CONCENTRATION = 0.1
 """Concentrations below this leave the azimuth open; the scale of a mode grows no further."""
-LEAST_WEIGHT = 1e-3
-"""Orientation modes of less weight are left out of files."""
+MIN_MODE_WEIGHT = 1e-3
+"""Orientation modes of less weight are left out of detections."""
 
 
 @dataclass(frozen=True)
@@ -141,56 +144,64 @@ class ObjectPosteriors:
         viewpoint = torch.from_numpy(np.concatenate([azimuth[..., None], tilt], axis=-1))
         ray = torch.from_numpy(np.asarray(self.position, dtype=np.float64))[:, None].expand(*azimuth.shape, 3)
         R = allocentric_to_egocentric(viewpoint_to_matrix(viewpoint), ray).numpy()
-        variance = 1.0 / np.maximum(np.asarray(self.viewpoint_modes.concentration, dtype=np.float64), LEAST_CONCENTRATION)
+        variance = 1.0 / np.maximum(np.asarray(self.viewpoint_modes.concentration, dtype=np.float64), MIN_CONCENTRATION)
         tilt_variance = (np.asarray(self.elevation_inplane_scale, dtype=np.float64) ** 2).sum(axis=-1, keepdims=True)
         weights = np.asarray(self.viewpoint_modes.weights, dtype=np.float64)
         return RotationModes(weights, R, np.sqrt((variance + tilt_variance) / 3))
 
-    def rows(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
-        """One JSON-able dictionary an object, the lines of `observations.jsonl` (the format SLAM reads)."""
-        import torch
+    def detections(self, frame: int, image: str | None = None, time: float | None = None) -> Detections:
+        """The objects as SLAM takes them; with those of other frames (`Detections.concatenate`) they make a `SlamProblem`.
 
-        from nolbo_ppl.geometry.rotation import matrix_to_quaternion  # torch is only needed here
+        Numbers are rounded to seven significant digits (covariances to ten): a file holds exactly what is here.
 
-        quaternion = matrix_to_quaternion(torch.from_numpy(np.array(self.R_camera_object, dtype=np.float64))).numpy()
+        Args:
+            frame: row of the odometry, from 0.
+            image: name of the image.
+            time: its time, s.
+        """
+        n, labels = len(self), self.class_log_likelihood.argmax(-1)
         modes = self.rotation_modes()
-        mode_quaternion = matrix_to_quaternion(torch.from_numpy(modes.R_camera_object)).numpy()
-        kept = modes.weights >= LEAST_WEIGHT
-        weights = modes.weights / np.sum(modes.weights, axis=1, where=kept, keepdims=True)
-        for i, category in enumerate(self.category):
-            yield {
-                "frame": frame,
-                "image": image,
-                "id": f"{frame:06d}-{i:03d}",
-                "box": _rounded(self.box[i], 2),
-                "objectness": round(float(self.objectness[i]), 6),
-                "category": category,
-                "class_posterior": dict(zip(self.categories, _rounded(self.class_posterior[i], 6))),
-                "position": _rounded(self.position[i], 5),
-                "position_cov": [_rounded(row, 9) for row in self.position_covariance[i]],
-                "rotation": _rounded(quaternion[i], 8),
-                "rotation_std": round(float(self.rotation_scale[i]), 5),
-                "rotation_modes": [
-                    {"weight": round(float(w), 5), "rotation": _rounded(q, 8), "std": round(float(s), 5)}
-                    for w, q, s in zip(weights[i][kept[i]], mode_quaternion[i][kept[i]], modes.scale[i][kept[i]])
-                ],
-                "viewpoint": _rounded(self.viewpoint[i], 5),
-                "azimuth_modes": [
-                    {"weight": round(float(w), 5), "azimuth": round(float(a), 5), "concentration": round(float(k), 3)}
-                    for w, a, k in zip(
-                        self.viewpoint_modes.weights[i],
-                        self.viewpoint_modes.azimuth[i],
-                        self.viewpoint_modes.concentration[i],
-                    )
-                ],
-                "latent": _rounded(self.latent[i], 5),
-                "latent_std": _rounded(self.latent_scale[i], 5),
-                "size": _rounded(self.size[i], 4),
-            }
+        kept = modes.weights >= MIN_MODE_WEIGHT
+        weight = np.where(kept, modes.weights, 0.0)
+        weight = significant(weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300))
+        order = np.argsort(~kept, axis=1, kind="stable")  # modes that are left out go last
 
+        def first(values: np.ndarray) -> np.ndarray:
+            return np.take_along_axis(values, order.reshape(*order.shape, *(1,) * (values.ndim - 2)), axis=1)
 
-def _rounded(values: Float[np.ndarray, " n"], digits: int) -> list[float]:
-    return [round(float(v), digits) for v in values]
+        def as_in_files(R: np.ndarray) -> np.ndarray:
+            return quaternion_to_matrix(rounded_quaternion(R))
+
+        return Detections(
+            frame=np.full(n, frame, dtype=np.int64),
+            position=significant(self.position),
+            position_covariance=significant(self.position_covariance, 10),
+            rotation=as_in_files(np.asarray(self.R_camera_object, dtype=np.float64)),
+            rotation_scale=significant(self.rotation_scale),
+            latent=significant(self.latent),
+            latent_scale=significant(self.latent_scale),
+            objectness=significant(self.objectness),
+            category=tuple(self.categories[k] for k in labels),
+            size=significant(self.size),
+            symmetry=np.full(n, -1, dtype=np.int64),
+            id=tuple(f"{frame:06d}-{i:03d}" for i in range(n)),
+            mode_weight=first(weight),
+            mode_rotation=first(np.where(kept[..., None, None], as_in_files(modes.R_camera_object), np.eye(3))),
+            mode_std=first(np.where(kept, significant(modes.scale), 1.0)),
+            image=(image,) * n,
+            time=np.full(n, np.nan if time is None else time),
+            box=significant(self.box),
+            class_names=self.categories,
+            class_posterior=significant(self.class_posterior),
+            viewpoint=significant(self.viewpoint),
+            azimuth_weight=significant(self.viewpoint_modes.weights),
+            azimuth=significant(self.viewpoint_modes.azimuth),
+            azimuth_concentration=significant(self.viewpoint_modes.concentration),
+        )
+
+    def rows(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
+        """One JSON-able dictionary an object, the lines of `observations.jsonl`."""
+        return to_records(self.detections(frame, image))
 
 
 __getattr__ = renamed(__name__, {"Observations": "ObjectPosteriors"})

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from nolbo_ppl.geometry.pose import quaternion_to_matrix, rotation_angle, so3_exp
+from nolbo_ppl.io.observations import read_observations, write_observations
+from nolbo_ppl.structures.detection_checks import check_table
+from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 UPRIGHT_AND_FACING_BACK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -88,16 +93,38 @@ def test_scale_of_a_mode_is_the_root_mean_square_of_its_angles() -> None:
     assert math.isfinite(found[0, 2])  # no concentration at all
 
 
+def test_detections_are_what_a_file_of_them_holds(tmp_path: Path) -> None:
+    """To the last bit: a map from memory is the map from the file."""
+    rng = np.random.default_rng(5)
+    root = rng.standard_normal((2, 3, 3))
+    seen = observations(
+        position=rng.standard_normal((2, 3)) + [0, 0, 6],
+        position_covariance=root @ root.swapaxes(1, 2) + 1e-3 * np.eye(3),
+        latent=rng.standard_normal((2, 2)).astype(np.float32),
+        R_camera_object=so3_exp(rng.standard_normal((2, 3))),
+        viewpoint=rng.standard_normal((2, 3)),
+    )
+    table = Detections.concatenate([seen.detections(3, "a.png", 0.25), seen[:0].detections(4), seen.detections(5, "b.png")])
+    write_observations(tmp_path / "o.jsonl", table)
+    back = read_observations(tmp_path / "o.jsonl", frames=6)
+    for field in dataclasses.fields(Detections):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(table, field.name), err_msg=field.name)
+    check_table(table, frames=6)
+    assert table.image == ("a.png", "a.png", "b.png", "b.png") and table.time[1] == 0.25 and np.isnan(table.time[2])
+    np.testing.assert_allclose(table.latent[2:], seen.latent, rtol=1e-6)
+    np.testing.assert_allclose(table.position_covariance[0], seen.position_covariance[0], rtol=1e-9)
+
+
 def test_rows_carry_the_whole_posterior() -> None:
     seen = observations()
     first, second = seen.rows(7, "000007.png")
     assert first["frame"] == 7 and first["id"] == "000007-000" and first["image"] == "000007.png"
     assert first["category"] == "car" and first["class_posterior"] == {"bottle": 0.2, "car": 0.8}
     assert second["objectness"] == 0.4 and second["latent_std"] == [0.3, 0.4]
-    np.testing.assert_allclose(first["position_cov"], seen.position_covariance[0])
+    np.testing.assert_allclose(first["position_std"], np.sqrt(np.diag(seen.position_covariance[0])))
     modes = seen.rotation_modes()
     # A mode without weight is left out, the others sum to one.
-    assert [m["weight"] for m in first["rotation_modes"]] == [round(0.7 / 0.9996, 5), round(0.2996 / 0.9996, 5)]
+    assert [m["weight"] for m in first["rotation_modes"]] == [float(f"{w / 0.9996:.7g}") for w in (0.7, 0.2996)]
     assert len(second["rotation_modes"]) == 3
     for row, i in ((first, 0), (second, 1)):
         for k, mode in enumerate(row["rotation_modes"]):
