@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from nolbo_ppl._version import __version__
 from nolbo_ppl.errors import NolboError
@@ -37,7 +41,10 @@ def usage() -> str:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run a verb; an error of the library ends with its message and exit status 2, without a traceback."""
+    """Run a verb; an error of the library or of the system ends with its message and status 2, without a traceback.
+
+    Ctrl-C ends with status 130, SIGTERM with 143, after temporary files and locks are gone.
+    """
     args = list(sys.argv[1:] if args is None else args)
     if not args or args[0] in ("-h", "--help"):
         print(usage())
@@ -48,11 +55,59 @@ def main(args: Sequence[str] | None = None) -> None:
     if args[0] not in VERBS:
         print(f"nolbo: unknown verb {args[0]!r}\n\n{usage()}", file=sys.stderr)
         raise SystemExit(2)
+    with _signals():
+        try:
+            importlib.import_module(f"nolbo_ppl.cli.{args[0]}").main(args[1:])
+            sys.stdout.flush()
+        except NolboError as error:
+            raise _end(args[0], str(error), 2) from None
+        except BrokenPipeError:  # who reads the output has heard enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            raise SystemExit(128 + signal.SIGPIPE) from None
+        except OSError as error:
+            raise _end(args[0], system_message(error), 2) from None
+        except MemoryError:
+            raise _end(args[0], "needs more memory than there is", 2) from None
+        except KeyboardInterrupt:
+            raise _end(args[0], "interrupted", 128 + signal.SIGINT) from None
+        except Stopped as stop:
+            raise _end(args[0], f"stopped by signal {stop}", 128 + stop.number) from None
+
+
+def system_message(error: OSError) -> str:
+    """What the system says about a file: its name and why."""
+    reason = error.strerror or str(error) or type(error).__name__
+    names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes | os.PathLike)]
+    return ": ".join([" -> ".join(names), reason] if names else [reason])
+
+
+def _end(verb: str, message: str, status: int) -> SystemExit:
+    print(f"nolbo {verb}: {message}", file=sys.stderr)
+    return SystemExit(status)
+
+
+class Stopped(BaseException):
+    """The process was asked to end: what is under way is cleaned up as on Ctrl-C."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """Turn SIGTERM and SIGHUP into an exception, so that temporary files and locks go; only the main thread may."""
+
+    def stop(number: int, _: object) -> None:
+        raise Stopped(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ends = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_DFL]  # not nohup
+    before = {number: signal.signal(number, stop) for number in ends}
     try:
-        importlib.import_module(f"nolbo_ppl.cli.{args[0]}").main(args[1:])
-    except NolboError as error:
-        print(f"nolbo {args[0]}: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print(f"nolbo {args[0]}: interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.files import read_text
 
 
 def read_words(path: Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of a text file without comments and blank lines. Raises `InputError` when it is none."""
-    if not path.is_file():
-        raise input_error("no such file", file=path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise input_error("not a text file", file=path) from None
+    lines = read_text(path).splitlines()
     split = [(number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in enumerate(lines, start=1)]
     return [(number, words) for number, words in split if words]

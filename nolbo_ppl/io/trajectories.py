@@ -3,7 +3,6 @@ their rows: frames of a sequence, covariances of the steps."""
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,9 +11,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.errors import InputError, input_error
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation, make_pose, matrix_to_quaternion, nearest_rotation, quaternion_to_matrix
-from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.io.files import atomic_path, read_text
+from nolbo_ppl.io.npz import read_npz
 
 TrajectoryFormat = Literal["kitti", "tum"]
 Covariances = Float[np.ndarray, "n-1 6 6"]
@@ -41,13 +41,8 @@ class Trajectory:
 
 def _numbers(path: Path) -> list[tuple[int, list[float]]]:
     """Line numbers and values of a table of numbers; comments and blank lines are skipped."""
-    if not path.is_file():
-        raise input_error("no such trajectory file", file=path)
     rows = []
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise input_error("not a text file", expected="a KITTI or TUM trajectory", file=path) from None
+    lines = read_text(path).splitlines()
     for number, text in enumerate(lines, start=1):
         text = text.split("#", 1)[0].replace(",", " ").strip()
         if not text:
@@ -199,20 +194,8 @@ def read_covariance(path: str | PathLike[str]) -> Covariances:
     Raises:
         InputError: no such file, or it holds no such array; names the file.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if "covariance" not in file.files:
-                raise input_error("no array `covariance`", got=file.files, file=path)
-            covariance = np.asarray(file["covariance"], dtype=np.float64)
-    except InputError:
-        raise
-    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
-        raise input_error(
-            "odometry covariance cannot be read", got=error, expected="an NPZ file with `covariance`", file=path
-        ) from None
-    if covariance.ndim != 3 or covariance.shape[1:] != (6, 6):
-        raise input_error("`covariance`", got=covariance.shape, expected="[n - 1, 6, 6], one a step", file=path)
-    return covariance
+    covariance = read_npz(path, {"covariance": (None, 6, 6)})["covariance"]
+    return covariance.astype(np.float64)
 
 
 def covariance_beside(trajectory: str | PathLike[str]) -> Covariances | None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +14,10 @@ from pathlib import Path
 import pytest
 
 from nolbo_ppl import __version__
-from nolbo_ppl.cli import VERBS, main
-from nolbo_ppl.errors import NolboError
+from nolbo_ppl.cli import VERBS, main, system_message
+from nolbo_ppl.errors import InputError, NolboError
+from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.io.output_folder import locked
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -120,3 +124,63 @@ def test_documented_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
             helps[key] = capsys.readouterr().out
         for option in re.findall(r"--[a-z][a-z0-9.-]*", text):
             assert re.search(re.escape(option) + r"(?![a-z0-9-])", helps[key]), f"{document}: {option} of nolbo {key}"
+
+
+def test_what_the_system_says_is_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "file"
+    file.write_text("x")
+    message = system_message(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file)))
+    assert message == f"{file}: No space left on device"
+    assert system_message(OSError(errno.EACCES, "no", "a", None, "b")) == "a -> b: no"
+    assert system_message(OSError("odd")) == "odd"
+    assert system_message(TimeoutError()) == "TimeoutError"
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (OSError(errno.EACCES, "Permission denied", "/place"), 2, "nolbo report: /place: Permission denied"),
+        (MemoryError(), 2, "nolbo report: needs more memory than there is"),
+        (KeyboardInterrupt(), 130, "nolbo report: interrupted"),
+        (InputError("x.json: bad"), 2, "nolbo report: x.json: bad"),
+    ],
+)
+def test_every_kind_of_failure_has_its_status(
+    error: BaseException, status: int, message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("nolbo_ppl.cli.report.main", fail)
+    with pytest.raises(SystemExit) as caught:
+        main(["report"])
+    assert caught.value.code == status
+    assert capsys.readouterr().err == message + "\n"
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("nolbo_ppl.cli.report.main", fail)
+    with pytest.raises(ZeroDivisionError):
+        main(["report"])
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_cleans_up(
+    number: signal.Signals, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(_: object) -> None:
+        with locked(tmp_path / "out"), atomic_path(tmp_path / "out" / "x.txt") as temporary:
+            temporary.write_text("half")
+            signal.raise_signal(number)
+
+    monkeypatch.setattr("nolbo_ppl.cli.report.main", work)
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as caught:
+        main(["report"])
+    assert caught.value.code == status
+    assert f"stopped by signal {number.name}" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert signal.getsignal(number) == before

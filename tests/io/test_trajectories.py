@@ -69,7 +69,7 @@ def test_damage_is_named(tmp_path: Path, text: str, match: str) -> None:
 
 
 def test_missing_and_binary_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such trajectory"):
+    with pytest.raises(InputError, match="no such file"):
         read_trajectory(tmp_path / "none.txt")
     (tmp_path / "b.txt").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError, match="not a text file"):
@@ -126,7 +126,7 @@ def test_covariances_and_every_kind_of_damage(tmp_path: Path) -> None:
     np.testing.assert_array_equal(covariance_beside(tmp_path / "odometry.txt"), good)
     for content, match in (
         ({"sigma": good}, r"no array `covariance`: got \['sigma'\]"),
-        ({"covariance": good[0]}, r"`covariance`: got \(6, 6\), expected \[n - 1, 6, 6\]"),
+        ({"covariance": good[0]}, r"`covariance`: got shape \[6, 6\], expected \[any, 6, 6\]"),
     ):
         np.savez(path, **content)
         with pytest.raises(InputError, match=r"odometry_covariance\.npz: .*" + match):
@@ -134,5 +134,5 @@ def test_covariances_and_every_kind_of_damage(tmp_path: Path) -> None:
     path.write_text("no archive")
     with pytest.raises(InputError, match="cannot be read"):
         read_covariance(path)
-    with pytest.raises(InputError, match=r"none\.npz: odometry covariance cannot be read"):
+    with pytest.raises(InputError, match=r"none\.npz: no such file"):
         read_covariance(tmp_path / "none.npz")
