@@ -11,20 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from nolbo_ppl.errors import InputError, NolboError, input_error
+from nolbo_ppl.errors import InputError, NolboError
+from nolbo_ppl.io.files import read_json
 from nolbo_ppl.parallel import parallel
 
 
-def fail() -> None:
-    raise input_error("bad", got=1, file="x.json", line=3)
-
-
 def test_order_and_errors() -> None:
-    jobs = [(pow, (i, 2)) for i in range(6)]
-    assert list(parallel(jobs, 2)) == [0, 1, 4, 9, 16, 25] == list(parallel(jobs, 1))
+    jobs = [*((pow, (i, 2)) for i in range(6)), (read_json, ("none.json",))]
     for workers in (1, 2):
-        with pytest.raises(InputError, match="x.json:3: bad: got 1"):
-            list(parallel([(fail, ())], workers))
+        results = parallel(jobs, workers)
+        assert [next(results) for _ in range(6)] == [0, 1, 4, 9, 16, 25]
+        with pytest.raises(InputError, match=r"none\.json: no such file"):
+            next(results)
 
 
 def test_a_killed_worker_is_said() -> None:
