@@ -15,7 +15,9 @@ from nolbo_ppl.data.converters import (
     convert_kitti_object,
     convert_kitti_poles,
     convert_kitti_tracking,
+    convert_photographs,
     convert_ycbv_slam,
+    read_photographs,
     write_converted,
 )
 
@@ -110,6 +112,24 @@ class KittiTracking:
 
 
 @dataclass(frozen=True)
+class Photographs:
+    """Labelled photographs (COCO's JSON), as scenes for `nolbo train`."""
+
+    data: Path
+    """The JSON file; images lie in the folder `images` beside it."""
+    out: Path
+    """Folder for images/, scenes.jsonl, source.json."""
+    leave_out: tuple[str, ...] = ()
+    """Names of sources (`source` of an image) to leave out."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        photographs = [one for one in read_photographs(self.data) if one.source not in self.leave_out]
+        counts = convert_photographs(photographs, self.out)
+        return f"{counts['images']} photographs, {counts['objects']} objects, {counts['viewpoints']} viewpoints"
+
+
+@dataclass(frozen=True)
 class YcbvSlam:
     """YCB-Video SLAM: real 6D detections with heavy tails, real odometry with added drift."""
 
@@ -147,15 +167,16 @@ Source = (
     Annotated[KittiObject, tyro.conf.subcommand("kitti-object")]
     | Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
     | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
+    | Annotated[Photographs, tyro.conf.subcommand("photographs")]
     | Annotated[YcbvSlam, tyro.conf.subcommand("ycbv-slam")]
 )
 
 
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
-    source: KittiObject | KittiPoles | KittiTracking | YcbvSlam
+    source: KittiObject | KittiPoles | KittiTracking | Photographs | YcbvSlam
     source = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
-    if isinstance(source, KittiObject):
+    if isinstance(source, KittiObject | Photographs):
         written = source.write()
     else:
         data = source.convert()

@@ -143,6 +143,9 @@ class SceneFolder:
 
     def _label_arrays(self) -> Arrays:
         labels = empty_labels(len(self.records), self.slots)
+        regions = max(len(record.ignore) for record in self.records)
+        labels["ignore"] = np.zeros((len(self.records), regions, 4), dtype=np.float32)
+        labels["exhaustive"] = np.ones((len(self.records), len(self.categories)), dtype=np.bool_)
         for row, record in enumerate(self.records):
             scale, left, top = self._placing(row)
             shift = np.array([left, top])
@@ -163,7 +166,15 @@ class SceneFolder:
                     labels["position"][at], labels["has_position"][at] = thing.position, True
                 if thing.size is not None:
                     labels["diagonal"][at], labels["has_size"][at] = thing.size, True
+            for number, box in enumerate(record.ignore):
+                labels["ignore"][row, number] = box * scale + np.tile(shift, 2)
+            if record.exhaustive is not None:
+                labels["exhaustive"][row] = [name in record.exhaustive for name in self.categories]
         labels["viewpoint"] = allocentric_viewpoints(labels)
+        if not any(len(record.ignore) for record in self.records):
+            del labels["ignore"]
+        if all(record.exhaustive is None for record in self.records):
+            del labels["exhaustive"]
         return labels
 
     def __len__(self) -> int:

@@ -42,7 +42,12 @@ def mirror(batch: SceneBatch, chosen: Bool[Tensor, " b"]) -> SceneBatch:
     def where(mirrored: Tensor, plain: Tensor) -> Tensor:
         return torch.where(chosen.view(-1, *(1,) * (plain.dim() - 1)), mirrored, plain)
 
+    ignore = batch.ignore
+    if ignore is not None:
+        left, top, right, bottom = ignore.unbind(-1)
+        ignore = where(torch.stack((width - right, top, width - left, bottom), -1), ignore)
     return batch.replace(
+        ignore=ignore,
         image=where(batch.image.flip(-1), batch.image),
         intrinsics=where(torch.stack((fx, fy, width - cx, cy), -1), batch.intrinsics),
         box=where(torch.stack((width - x1, y0, width - x0, y1), -1), batch.box),

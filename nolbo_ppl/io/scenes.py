@@ -3,7 +3,8 @@
 A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objects": [...]}`; an object is
 `{"box": [x0, y0, x1, y1] px, "category", "instance", "rotation": [qx, qy, qz, qw] of R_camera_object, "position":
 [x, y, z] m of the box centre in the camera frame, "size": m (box diagonal), "dimensions": [3] m, "visibility",
-"symmetry"}`. Only `image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
+"symmetry"}`. A line may have `"ignore"`, boxes of parts of the image that are not labelled, and `"exhaustive"`, the
+categories of which every instance is labelled (all of them when it is missing). Only `image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ class SceneRecord:
     intrinsics: Float[np.ndarray, " 4"]
     objects: tuple[ObjectRecord, ...]
     ignore: Float[np.ndarray, "k 4"]
-    """Boxes of parts of the image whose objects are not labelled: what is found there is not judged."""
+    """Boxes of parts of the image whose objects are not labelled: nothing is learnt of them, and what is found there is not
+    judged."""
+    exhaustive: tuple[str, ...] | None = None
+    """Categories of which every instance is labelled; None for all of them."""
 
 
 def _is_number(value: object) -> bool:
@@ -174,8 +178,14 @@ def parse_record(
     regions = [] if row.get("ignore") is None else row["ignore"]
     if not isinstance(regions, list):
         raise at.error("ignore", regions, "a list of boxes [x0, y0, x1, y1] in px")
+    exhaustive = row.get("exhaustive")
+    if exhaustive is not None:
+        if not isinstance(exhaustive, list) or not all(isinstance(name, str) and name in categories for name in exhaustive):
+            raise at.error("exhaustive", exhaustive, "a list of categories among " + ", ".join(categories))
+        exhaustive = tuple(exhaustive)
     ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
-    return SceneRecord(image, intrinsics, tuple(parsed), np.array(ignore, dtype=np.float64).reshape(-1, 4))
+    regions_ignored = np.array(ignore, dtype=np.float64).reshape(-1, 4)
+    return SceneRecord(image, intrinsics, tuple(parsed), regions_ignored, exhaustive)
 
 
 def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Path:

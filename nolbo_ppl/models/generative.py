@@ -93,7 +93,8 @@ class GenerativeModel(nn.Module):
             eps = config.objectness_epsilon
             logit = math.log1p(-eps) - math.log(eps)
             prior = Objectness(logits=torch.where(where.is_object, logit, -logit).to(batch.box))
-            pyro.sample("objectness", prior, infer={"truth": prior})
+            with poutine.mask(mask=True if where.counted is None else where.counted):
+                pyro.sample("objectness", prior, infer={"truth": prior})
         with scenes, pyro.plate("objects", where.assigned.shape[1], dim=-1), poutine.mask(mask=where.assigned):
             latent = shape_site(self.prior, batch, where.assigned)
             self._orientation(batch)

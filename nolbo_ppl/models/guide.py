@@ -153,6 +153,18 @@ class Guide(nn.Module):
         raw = raw.index_put((row, slot), refined.to(raw.dtype))
         return self.head.parameters_of(raw, self._prior().label_mean())
 
+    def responsible_region(
+        self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
+    ) -> Int[Tensor, " n"]:
+        """Region responsible for each given box: in its cell the predictor whose own box overlaps it most (NOLBO,
+        implementation)."""
+        p, columns = self.config.predictors, encoding.columns
+        cell = cell_of(box, encoding.rows, columns, self.config.stride)
+        region = (cell[:, None] * p + torch.arange(p)).flatten()
+        q = self.parameters_at(encoding, row.repeat_interleave(p), region, look=False)
+        own = decode_box(q.box_loc, region // p, columns, self.config).unflatten(0, (-1, p))
+        return cell * p + box_iou(own, box[:, None]).argmax(-1)
+
     def forward(self, scene: ObservedScene) -> None:
         """The Pyro guide: the sites of `Story`, amortised."""
         batch, q, assigned = scene.batch, scene.posterior, scene.assignment.assigned

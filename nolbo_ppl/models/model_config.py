@@ -1,4 +1,4 @@
-"""Configuration of the generative story and its guide, and the presets `nano`, `tiny` and `paper`."""
+"""Configuration of the generative story and its guide, and the presets `nano`, `tiny`, `photo` and `paper`."""
 
 from __future__ import annotations
 
@@ -85,6 +85,9 @@ class ModelConfig:
     range_scale: float = 0.02
     """Scale of the observed range, direction and size about their latent, in latent units."""
 
+    detector: Literal["", "yolox_nano"] = ""
+    """Detector whose predictions are evidence beside the tiny encoder's (`nolbo_ppl.models.hybrid_guide`); none by default."""
+
     def __post_init__(self) -> None:
         if len(self.symmetry) != len(self.categories):
             raise input_error("one symmetry per category is needed", got=len(self.symmetry), expected=len(self.categories))
@@ -122,6 +125,11 @@ class ModelConfig:
                 "second look",
                 got=f"glimpse_maps={self.glimpse_maps}, glimpse_blocks={self.glimpse_blocks}",
                 expected="1 to 3 maps, blocks >= 0",
+            )
+        if self.detector and (self.encoder != "tiny" or self.instances or not self.glimpse):
+            raise input_error(
+                "a detector beside the encoder", got=f"encoder {self.encoder}, glimpse {self.glimpse}",
+                expected="the tiny encoder with a second look, no instance labels",
             )
         if self.image_size % 32 or self.image_size <= 0:
             raise input_error("image_size", got=self.image_size, expected="a positive multiple of 32")
@@ -171,6 +179,11 @@ def tiny() -> ModelConfig:
     return ModelConfig(encoder_blocks=(1, 3, 4), glimpse_maps=3, glimpse_blocks=2, glimpse_detail=True, image_size=192)
 
 
+def photo() -> ModelConfig:
+    """For photographs: `tiny` with the evidence of a detector beside it, 416 px, 5.3 M parameters."""
+    return dataclasses.replace(tiny(), detector="yolox_nano", image_size=416)
+
+
 def nano() -> ModelConfig:
     """For demonstrations and tests: 0.15 M parameters, 64 px, learns the outlines within minutes and no more."""
     return ModelConfig(
@@ -201,5 +214,5 @@ def paper() -> ModelConfig:
     )
 
 
-PRESETS = {"nano": nano, "tiny": tiny, "paper": paper}
+PRESETS = {"nano": nano, "tiny": tiny, "photo": photo, "paper": paper}
 """The named configurations."""

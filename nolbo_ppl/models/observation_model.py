@@ -7,6 +7,7 @@ from torch import nn
 
 from nolbo_ppl.models.generative import GenerativeModel
 from nolbo_ppl.models.guide import Guide
+from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.shape_vae import ShapeGuide, ShapeStory
 
@@ -18,7 +19,7 @@ class Nolbo(nn.Module):
         super().__init__()
         self.config = config
         self.story = GenerativeModel(config)
-        self.guide = Guide(config, self.story.prior)
+        self.guide = HybridGuide(config, self.story.prior) if config.detector else Guide(config, self.story.prior)
         self.shape_guide = ShapeGuide(config)
 
     def set_half_precision(self, enabled: bool) -> None:

@@ -56,6 +56,10 @@ class SceneBatch:
     """Mean of the shape autoencoder's posterior of the true voxels."""
     shape_scale: Float[Tensor, "b m d"] | None = None
     """Scale of that posterior."""
+    ignore: Float[Tensor, "b r 4"] | None = None
+    """Boxes, px, of parts of the images whose objects are not labelled; empty boxes are none."""
+    exhaustive: Bool[Tensor, "b labels"] | None = None
+    """Categories of which every instance in the image is labelled; all of them when it is not given."""
     noise: Float[Tensor, "b m d"] | None = None
     """Standard normal noise of the shape latent's sample; drawn from torch's generator when it is not given."""
 
@@ -111,6 +115,8 @@ class Assignment:
     """Observed range, direction and size in latent units."""
     has_range: Bool[Tensor, "b m"]
     """The range is observed: position and size are both known."""
+    counted: Bool[Tensor, "b k"] | None = None
+    """Regions of which it is known whether they describe an object; all of them when it is not given."""
 
 
 def grid_size(height: int, width: int, config: ModelConfig) -> tuple[int, int]:

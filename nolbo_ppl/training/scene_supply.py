@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,11 +43,12 @@ class SceneSubset:
 
 
 class JoinedScenes:
-    """Several data sets of one pool of shapes, one after the other."""
+    """Several data sets of one pool of shapes, one after the other; smaller images are enlarged to the size of the largest."""
 
     def __init__(self, parts: Sequence[CachedScenes]) -> None:
         self.parts = parts
         self._first = np.cumsum([0, *(len(part) for part in parts)])
+        self.size = max(part.size for part in parts)
 
     def __len__(self) -> int:
         return int(self._first[-1])
@@ -59,7 +62,7 @@ class JoinedScenes:
             rows = np.flatnonzero(owner == number)
             if not len(rows):
                 continue
-            for name, value in part.batch(index[rows] - self._first[number]).items():
+            for name, value in enlarged(part.batch(index[rows] - self._first[number]), self.size).items():
                 if name not in result:
                     result[name] = np.empty((len(index), *value.shape[1:]), value.dtype)
                 result[name][rows] = value
@@ -70,6 +73,19 @@ class JoinedScenes:
         number, packed, category = (np.concatenate(values) for values in zip(*(part.shapes() for part in self.parts)))
         number, first = np.unique(number, return_index=True)
         return number, packed[first], category[first]
+
+
+def enlarged(arrays: Arrays, size: int) -> Arrays:
+    """Square scenes brought to a side of `size` px, labels with them."""
+    side = arrays["image"].shape[-1]
+    if side == size:
+        return arrays
+    image = torch.nn.functional.interpolate(
+        torch.from_numpy(arrays["image"]).float(), (size, size), mode="bilinear", align_corners=False
+    )
+    factor = np.float32(size / side)
+    changes = {"image": image.round().to(torch.uint8).numpy(), "intrinsics": arrays["intrinsics"] * factor}
+    return {**arrays, **changes, "box": arrays["box"] * factor}
 
 
 class ShapeTable:
@@ -215,3 +231,64 @@ class SceneSupply:
         if mirrored is not None:
             batch = mirror(batch, mirrored)
         return batch.replace(instance=torch.where(batch.instance < self.known, batch.instance, -1))
+
+
+class MixedSupply:
+    """Batches with a fixed number of scenes from each of several data sets, put together.
+
+    Args:
+        parts: the supply of each data set; all give images of one size.
+    """
+
+    def __init__(self, parts: Sequence[SceneSupply]) -> None:
+        self.parts = tuple(parts)
+
+    def batch(self, step: int) -> SceneBatch:
+        """The batch of a step: scenes of the first data set, then of the second, ..."""
+        return join_batches([part.batch(step) for part in self.parts])
+
+
+def join_batches(batches: Sequence[SceneBatch]) -> SceneBatch:
+    """Batches of images of one size as one; object slots and regions to ignore are filled up to the largest number.
+
+    A field that only some batches have is filled with what its absence means.
+    """
+    slots = max(batch.box.shape[1] for batch in batches)
+    regions = max((0 if batch.ignore is None else batch.ignore.shape[1]) for batch in batches)
+    labels = next((batch.exhaustive.shape[1] for batch in batches if batch.exhaustive is not None), 0)
+    latent = next((batch.shape_loc.shape[2] for batch in batches if batch.shape_loc is not None), 0)
+    voxels = max(batch.voxels.shape[2] for batch in batches)
+    joined: dict[str, Any] = {}
+    for field in dataclasses.fields(SceneBatch):
+        parts = []
+        for batch in batches:
+            value, scenes, at = getattr(batch, field.name), len(batch.image), batch.box
+            if value is None:
+                missing = {
+                    "ignore": at.new_zeros(scenes, 0, 4), "exhaustive": torch.ones(scenes, labels, dtype=torch.bool),
+                    "shape_index": torch.full(batch.present.shape, -1), "shape_loc": at.new_zeros(*at.shape[:2], latent),
+                    "shape_scale": at.new_ones(*at.shape[:2], latent),
+                }  # fmt: skip
+                value = missing.get(field.name)
+            if value is not None and field.name not in ("image", "intrinsics", "exhaustive"):
+                value = _filled(value, regions if field.name == "ignore" else slots, field.name)
+            if field.name == "image" and value.dtype != torch.float32 and len(batches) > 1:
+                value = value.float()
+            parts.append(value)
+        absent = any(part is None for part in parts) or (field.name == "exhaustive" and not labels)
+        absent |= field.name.startswith("shape_") and not latent or field.name == "ignore" and not regions
+        joined[field.name] = None if absent else torch.cat(parts)
+    if any(batch.voxels.shape[2] != voxels for batch in batches):
+        raise input_error("voxels of data sets to mix", got=[batch.voxels.shape[2] for batch in batches], expected="one size")
+    return SceneBatch(**joined)
+
+
+_EMPTY = {"category": -1.0, "instance": -1.0, "shape_index": -1.0, "symmetry": 1.0, "diagonal": 1.0, "visibility": 1.0,
+          "shape_scale": 1.0}  # fmt: skip
+"""What an empty slot holds where it is not zero."""
+
+
+def _filled(value: Tensor, count: int, name: str) -> Tensor:
+    """A field with slots added up to a number of them."""
+    more = value.new_full((len(value), count - value.shape[1], *value.shape[2:]), _EMPTY.get(name, 0.0))
+    return torch.cat((value, more), 1)

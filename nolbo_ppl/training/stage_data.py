@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +13,29 @@ import torch.distributed as distributed
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.data.loader import Scenes, prefetch
-from nolbo_ppl.data.scene_cache import CachedScenes, write_cache
+from nolbo_ppl.data.scene_cache import write_cache
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
-from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, rendered_size
+from nolbo_ppl.synthetic.scenes.scene_config import rendered_size
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
-from nolbo_ppl.training.scene_supply import JoinedScenes, SceneSubset, SceneSupply, ShapeTable
+from nolbo_ppl.training.scene_supply import JoinedScenes, MixedSupply, SceneSubset, SceneSupply, ShapeTable
 from nolbo_ppl.training.stages import seeded_noise
 from nolbo_ppl.training.train_config import TrainConfig
 
 VALIDATION_SEED = 1000
 """Added to the seed of generated scenes for the held-out ones: other scenes, other shapes."""
 
+HELD_OUT_EVERY = 10
+"""One scene of so many of each data set of a mix is held out."""
 LEAST_HELD_OUT = 512
 """Least number of generated held-out scenes."""
 
 
 class TrainingData:
-    """The data of all stages: generated and cached, or a folder's."""
+    """The data of all stages: generated and cached, of a folder, or of several of these in fixed shares."""
 
     def __init__(self, config: TrainConfig, rank: int, world: int) -> None:
         self.config, self.rank, self.world = config, rank, world
@@ -41,46 +43,83 @@ class TrainingData:
         self.augmentation: Augmentation | None = None
         if config.augment:
             self.augmentation = Augmentation(mirror_probability=0.5 if config.mirror and not config.instance_labels else 0.0)
-        size = self.model.image_size
         self.train: Scenes
         self.single: Scenes
         self._held_out: Scenes
-        if config.scenes is not None:
-            self._open_folders(config.scenes, size)
+        self._mix: list[tuple[Scenes, ShapeTable, int]] = []
+        self._held_out_mix: list[tuple[Scenes, ShapeTable]] = []
+        if len(config.scenes) + config.generated > 1:
+            self._open_mix()
+        elif config.scenes:
+            self._open_folders(config.scenes[0], self.model.image_size)
         else:
-            size = rendered_size(size)
-            mixed = config.difficulty == "mixed"
-            kinds = ("standard", "full") if mixed else (config.difficulty,)
-            bases = [scene_preset(kind, size) for kind in kinds]
-            if mixed:  # CAD without materials, and photographs, look like no other generated scene
-                bases[1] = dataclasses.replace(bases[1], single_material=0.25, photographs=0.85)
-            photographs = None if config.backgrounds is None else str(config.backgrounds)
-            root = config.cache.expanduser() / "scenes"
-            if world > 1 and rank > 0:
-                distributed.barrier()  # the first process renders what is missing
-            single = dataclasses.replace(bases[0], objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
-
-            def source(of: SceneConfig, seed: int) -> SceneSource:
-                return SceneSource(of, seed, backgrounds=None if mixed and of is bases[0] else photographs)
-
-            def cached(of: SceneSource | ViewSource, count: int) -> CachedScenes:
-                return write_cache(root, of, count, config.workers)
-
-            def all_of(seed: int, count: int) -> JoinedScenes:
-                sources = [source(base, seed) for base in bases] + ([ViewSource(ViewConfig(size), seed)] if mixed else [])
-                return JoinedScenes([cached(one, -(-count // len(sources))) for one in sources])
-
-            train = all_of(config.seed, config.count)
-            held_out_scenes = all_of(config.seed + VALIDATION_SEED, max(LEAST_HELD_OUT, config.evaluate_scenes))
-            self.train, self._held_out = train, held_out_scenes
-            self.single = self.train
-            if config.single_steps:
-                self.single = cached(source(single, config.seed), config.single_count)
-            if world > 1 and rank == 0:
-                distributed.barrier()
-            self.table, self._held_out_table = ShapeTable(*train.shapes()), ShapeTable(*held_out_scenes.shapes())
+            self._generate()
         if len(self.table) == 0 and config.shape_steps:
             raise input_error("no shapes to learn", got=config.scenes, do="add voxels.npz, or use --shape-steps 0")
+
+    def _sources(self, seed: int) -> list[SceneSource | ViewSource]:
+        """Where generated scenes come from: a source for each kind of scene and each size."""
+        config = self.config
+        mixed = config.difficulty == "mixed"
+        photographs = None if config.backgrounds is None else str(config.backgrounds)
+        sources: list[SceneSource | ViewSource] = []
+        sizes = config.render_sizes or (rendered_size(self.model.image_size),)
+        for size in sizes:
+            for kind in ("standard", "full") if mixed else (config.difficulty,):
+                base = scene_preset(kind, size)
+                if mixed and kind == "full":  # CAD without materials, and photographs, look like no other generated scene
+                    base = dataclasses.replace(base, single_material=0.25, photographs=0.85)
+                behind = None if mixed and kind == "standard" else photographs
+                sources.append(SceneSource(base, seed, backgrounds=behind))
+        if mixed:
+            sources.append(ViewSource(ViewConfig(min(sizes)), seed))
+        return sources
+
+    def _cached(self, sources: Sequence[SceneSource | ViewSource], count: int) -> JoinedScenes:
+        """Scenes of some sources, as many of each; the first process renders what is missing."""
+        root = self.config.cache.expanduser() / "scenes"
+        return JoinedScenes([write_cache(root, one, -(-count // len(sources)), self.config.workers) for one in sources])
+
+    def _generate(self) -> None:
+        """Generated scenes, and held-out ones of another seed."""
+        config = self.config
+        if self.world > 1 and self.rank > 0:
+            distributed.barrier()
+        train = self._cached(self._sources(config.seed), config.count)
+        held_out = self._cached(self._sources(config.seed + VALIDATION_SEED), max(LEAST_HELD_OUT, config.evaluate_scenes))
+        self.train, self._held_out = train, held_out
+        self.single = self.train
+        if config.single_steps:
+            base = self._sources(config.seed)[0].config
+            single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))  # type: ignore[type-var]
+            behind = None if config.difficulty == "mixed" or config.backgrounds is None else str(config.backgrounds)
+            source = SceneSource(single, config.seed, backgrounds=behind)  # type: ignore[arg-type]
+            self.single = self._cached([source], config.single_count)
+        if self.world > 1 and self.rank == 0:
+            distributed.barrier()
+        self.table, self._held_out_table = ShapeTable(*train.shapes()), ShapeTable(*held_out.shapes())
+
+    def _open_mix(self) -> None:
+        """Folders and generated scenes in fixed shares; every tenth scene of each is held out."""
+        config = self.config
+        parts: list[SceneFolder | JoinedScenes] = [
+            SceneFolder(path, self.model.categories, size=self.model.image_size, symmetry=self.model.symmetry)
+            for path in config.scenes
+        ]
+        if config.generated:
+            if self.world > 1 and self.rank > 0:
+                distributed.barrier()
+            parts.append(self._cached(self._sources(config.seed), config.count))
+            if self.world > 1 and self.rank == 0:
+                distributed.barrier()
+        for part, scenes in zip(parts, shares(config.mix or (1.0,) * len(parts), config.batch)):
+            held = np.arange(len(part)) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+            table = ShapeTable(*part.shapes())
+            self._mix.append((SceneSubset(part, np.flatnonzero(~held)), table, scenes))
+            self._held_out_mix.append((SceneSubset(part, np.flatnonzero(held)), table))
+        self.table = self._held_out_table = self._mix[-1][1]
+        self.train = self.single = self._mix[-1][0]
+        self._held_out = self._held_out_mix[-1][0]
 
     def _open_folders(self, path: Path, size: int) -> None:
         """A user's folder, and a held-out one or its last tenth."""
@@ -89,7 +128,9 @@ class TrainingData:
         if self.config.instance_labels:
             number, _, category = folder.shapes()
             names = tuple(folder.instances[n] for n in number)
-            self.model = dataclasses.replace(self.model, instances=names, instance_category=tuple(int(c) for c in category))
+            self.model = dataclasses.replace(
+                self.model, instances=names, instance_category=tuple(int(c) for c in category)
+            )
             others = tuple(name for name in folder.instances if name not in set(names))
             folder = SceneFolder(path, self.model.categories, names + others, size=size, symmetry=self.model.symmetry)
             known = len(names)
@@ -119,19 +160,19 @@ class TrainingData:
                     step += 1
 
             return shapes()
-        supply = SceneSupply(
-            self.single if stage == "single" else self.train,
-            self.table,
-            config.batch,
-            3 * config.seed + (1 if stage == "single" else 2),
-            latent,
-            self.augmentation,
-            self.model.image_size,
-            config.sizes,
-            len(self.model.instances),
-            self.rank,
-            self.world,
-        )
+        seed = 3 * config.seed + (1 if stage == "single" else 2)  # one for all parts: they choose the same size
+
+        def supply_of(scenes: Scenes, table: ShapeTable, batch: int) -> SceneSupply:
+            return SceneSupply(
+                scenes, table, batch, seed, latent, self.augmentation, self.model.image_size, config.sizes,
+                len(self.model.instances), self.rank, self.world,
+            )  # fmt: skip
+
+        supply: SceneSupply | MixedSupply
+        if self._mix:
+            supply = MixedSupply([supply_of(*part) for part in self._mix])
+        else:
+            supply = supply_of(self.single if stage == "single" else self.train, self.table, config.batch)
 
         def scenes() -> Iterator[SceneBatch]:
             step = start
@@ -143,18 +184,37 @@ class TrainingData:
 
     def validation(self, count: int | None) -> Iterator[SceneBatch]:
         """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
-        known = len(self.model.instances)
-        supply = SceneSupply(
-            self._held_out, self._held_out_table, 64, 0, self.model.latent_dim, size=self.model.image_size, known_instances=known
-        )
-        total = len(self._held_out) if count is None else min(count, len(self._held_out))
-        for first in range(0, total, 64):
-            batch = supply.prepared(np.arange(first, min(first + 64, total)))
-            yield batch.replace(noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim))
+        parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
+        for scenes, table in parts:
+            supply = SceneSupply(scenes, table, 64, 0, self.model.latent_dim, size=self.model.image_size,
+                                 known_instances=len(self.model.instances))
+            total = len(scenes) if count is None else min(-(-count // len(parts)), len(scenes))
+            step = 64 if self.model.image_size <= 256 else 16
+            for first in range(0, total, step):
+                batch = supply.prepared(np.arange(first, min(first + step, total)))
+                yield batch.replace(noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim))
 
     def teach(self, model: Nolbo) -> None:
         """Encode the shapes by the trained shape guide, in full precision."""
         model.set_half_precision(False)
-        self.table.teach(model, mirrored=self.augmentation is not None and self.augmentation.mirror_probability > 0)
+        mirrored = self.augmentation is not None and self.augmentation.mirror_probability > 0
+        for table in [table for _, table, _ in self._mix] or [self.table]:
+            table.teach(model, mirrored=mirrored)
         if self._held_out_table is not self.table:
             self._held_out_table.teach(model)
+
+
+def shares(mix: Sequence[float], batch: int) -> list[int]:
+    """Scenes of each part in a batch: the shares, rounded so that they sum to it, each at least one.
+
+    Raises:
+        InputError: a batch smaller than the number of parts.
+    """
+    if batch < len(mix):
+        raise input_error("batch", got=batch, expected=f"at least one scene of each of {len(mix)} data sets")
+    ends = np.round(np.cumsum(mix) / np.sum(mix) * batch).astype(int)
+    counts = np.diff(ends, prepend=0)
+    while counts.min() < 1:
+        counts[counts.argmax()] -= 1
+        counts[counts.argmin()] += 1
+    return counts.tolist()

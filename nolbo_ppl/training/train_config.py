@@ -6,7 +6,9 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
@@ -21,7 +23,7 @@ DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
 """Where rendered scenes are kept between runs."""
 FREE_FIELDS = ("out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every")
 """Fields a resumed run may change: they do not touch what is learnt."""
-OPTIONAL_FIELDS = ("categories", "symmetry", "grow")
+OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes")
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
@@ -31,8 +33,11 @@ class TrainConfig:
 
     out: Path = Path("runs/tiny")
     """Folder of the run: configuration, metrics.jsonl, checkpoint, and at the end the model."""
-    preset: Literal["nano", "tiny", "paper"] = "tiny"
-    """Networks: `tiny` for CPUs, `paper` for darknet19 and 64^3 voxels, `nano` for demonstrations."""
+    preset: Literal["nano", "tiny", "photo", "paper"] = "tiny"
+    """Networks: `tiny` for CPUs, `photo` for photographs, `paper` for darknet19 and 64^3 voxels, `nano` for demonstrations."""
+    detector: Path | None = None
+    """ONNX file of YOLOX-nano, whose predictions the preset `photo` starts from (extra `detector`); not needed with the
+    weights of such a preset as `initial`."""
     objective: Literal["inclusive", "elbo", "paper"] = "inclusive"
     """What is maximised: the inclusive objective, the pure bound, or the paper's (the bound with objectness turned)."""
     orientation: Literal["mixture", "angle", "sincos"] | None = None
@@ -48,8 +53,14 @@ class TrainConfig:
     """Dimensions of the shape latent; the preset's by default."""
     image_size: int | None = None
     """Side in px of the images the network looks at, a multiple of 32; the preset's, or the initial weights', by default."""
-    scenes: Path | None = None
-    """Folder of a data set written by `nolbo scenes`, or of your own; without it scenes are generated."""
+    scenes: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Folder of a data set written by `nolbo scenes`, or of your own; may be given several times. Without it scenes are
+    generated."""
+    mix: tuple[float, ...] = ()
+    """Share of each of `scenes` in every batch; one number more than folders is that of generated scenes. By default a
+    single folder stands alone, several have equal shares."""
+    render_sizes: tuple[int, ...] = ()
+    """Sides, px, at which generated scenes are rendered, as many of each; 128 or less by default."""
     validation: Path | None = None
     """Folder of held-out scenes; with `scenes` and without this, the last tenth of `scenes` is held out."""
     count: int = 16384
@@ -120,6 +131,19 @@ class TrainConfig:
     """Go on from the run's checkpoint where there is one; otherwise a folder with a checkpoint is refused."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.scenes, str | Path) or self.scenes is None:
+            object.__setattr__(self, "scenes", () if not self.scenes else (Path(self.scenes),))
+        if self.mix and len(self.mix) - len(self.scenes) not in (0, 1):
+            raise input_error("mix", got=f"{len(self.mix)} shares of {len(self.scenes)} folders",
+                              expected="a share of each of --scenes, and one more for generated scenes if they are wanted")
+        if any(share <= 0 for share in self.mix):
+            raise input_error("mix", got=self.mix, expected="positive shares")
+        if any(size % 32 or size <= 0 for size in self.render_sizes):
+            raise input_error("render_sizes", got=self.render_sizes, expected="positive multiples of 32")
+        if self.detector is not None and self.preset != "photo":
+            raise input_error("a detector", got=f"preset {self.preset}", do="add --preset photo")
+        if self.instance_labels and (len(self.scenes) > 1 or self.generated):
+            raise input_error("instance labels of several data sets", do="give one folder of --scenes")
         at_least_one = (
             "batch",
             "shape_batch",
@@ -146,11 +170,11 @@ class TrainConfig:
             raise input_error("sizes", got=self.sizes, expected="positive multiples of 32")
         if self.grow and self.initial is None:
             raise input_error("networks to grow", got="no initial weights", do="give --initial, or leave --grow out")
-        if self.instance_labels and self.scenes is None:
+        if self.instance_labels and not self.scenes:
             raise input_error("instance labels", got="generated scenes", do="give --scenes with its own instances")
-        if self.validation is not None and self.scenes is None:
+        if self.validation is not None and not self.scenes:
             raise input_error("held-out scenes without training scenes", do="give --scenes too")
-        if self.categories and self.scenes is None:
+        if self.categories and not self.scenes:
             raise input_error(
                 "own categories",
                 got="generated scenes, which show the twelve of `nolbo_ppl.categories`",
@@ -165,10 +189,20 @@ class TrainConfig:
         if any(order < 0 for order in self.symmetry):
             raise input_error("symmetry", got=self.symmetry, expected="1 (none), n (n-fold) or 0 (free) for each category")
 
+    @property
+    def start(self) -> str | None:
+        """Weights to start from: `initial`; those of the preset `photo` start from `tiny`'s."""
+        return "tiny" if self.preset == "photo" and self.initial is None else self.initial
+
+    @property
+    def generated(self) -> bool:
+        """Whether generated scenes are learnt from."""
+        return not self.scenes or len(self.mix) > len(self.scenes)
+
     def model(self) -> ModelConfig:
         """Configuration of the networks. Raises `InputError` where initial weights and other fields disagree."""
-        if self.initial is not None:
-            config = load(self.initial).config
+        if self.start is not None:
+            config = load(self.start).config
             if self.orientation not in (None, config.orientation) or self.latent_dim not in (None, config.latent_dim):
                 raise input_error(
                     "initial weights of another form",
@@ -182,6 +216,8 @@ class TrainConfig:
                     expected=f"{' '.join(self.categories)} of symmetry {' '.join(map(str, self._symmetry()))}",
                     do="leave --categories and --symmetry out, or train without --initial",
                 )
+            if self.preset == "photo" and not config.detector:
+                config = dataclasses.replace(config, detector="yolox_nano", image_size=PRESETS["photo"]().image_size)
             if self.grow:
                 config = grown_config(config, PRESETS[self.preset]())
             return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)

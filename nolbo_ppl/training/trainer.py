@@ -25,6 +25,7 @@ from nolbo_ppl.inference.posterior.model_folder import load, save
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.training.detector_file import adopt
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.stage_data import TrainingData
@@ -62,11 +63,11 @@ def run(config: TrainConfig) -> TrainSummary:
         torch.set_num_threads(config.threads)
     data = TrainingData(config, rank, world)
     model = Nolbo.from_seed(data.model, config.seed)
-    if config.initial is not None:
-        initial = load(config.initial).model
+    if config.start is not None:
+        initial = load(config.start).model
         if config.grow:
             initial = grow(initial, model.config, config.seed)
-        model.load_state_dict(initial.state_dict())
+        adopt(model, initial, config.detector)
     journal = Journal(config, rank)
     stages = config.stages()
     first, tensors, at_step = journal.resume(model, stages)

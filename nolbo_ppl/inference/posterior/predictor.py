@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.boxes import box_iou, suppress
+from nolbo_ppl.geometry.boxes import suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
 from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer, decode_latents, extents, sampled_shapes
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
@@ -22,7 +22,7 @@ from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guess
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import Encoding, RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
-from nolbo_ppl.models.scene_batch import cell_of, decode_box
+from nolbo_ppl.models.scene_batch import decode_box
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 CANDIDATE = 0.02
@@ -138,7 +138,7 @@ class ObservationModel:
             scaled = [np.asarray(boxes[i], dtype=np.float64).reshape(-1, 4) * np.tile(prepared[i].scale, 2) for i in group]
             row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
             box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
-            region = self._responsible(encoding, row, box)
+            region = self.model.guide.responsible_region(encoding, row, box)
             return row, region, logit[row, region], box
 
         return self._observe(prepared, responsible, decode, samples, seed, batch)
@@ -203,7 +203,8 @@ class ObservationModel:
         """Row, region and log odds of the objects above the threshold, best first in a row.
 
         Regions whose boxes overlap describe one object, for which exactly one of them is responsible: the probability
-        that it is there is the sum of theirs. The most probable region answers for it.
+        that it is there is the sum of theirs. The most probable region answers for it. With a detector's evidence, which
+        gives one object to many regions, its probability is that of the most probable one.
         """
         least = min(threshold, CANDIDATE)
         row, region = (logit > math.log(least / (1 - least))).nonzero(as_tuple=True)
@@ -211,20 +212,14 @@ class ObservationModel:
             return row, region, logit.new_empty(0)
         box = self._boxes(encoding, row, region)
         kept, stands_for = suppress(box, logit[row, region], iou_threshold, group=row)
-        probability = torch.zeros(len(row), dtype=torch.float64)
-        probability.index_add_(0, stands_for, torch.sigmoid(logit[row, region].double()))
+        probability = torch.sigmoid(logit[row, region].double())
+        if not self.config.detector:
+            probability = torch.zeros(len(row), dtype=torch.float64).index_add_(0, stands_for, probability)
         probability = probability.clamp(max=1 - 1e-6)
         kept = kept[probability[kept] > threshold]
         kept = kept[torch.argsort(probability[kept], descending=True, stable=True)]
         kept = kept[torch.argsort(row[kept], stable=True)]
         return row[kept], region[kept], torch.logit(probability[kept])
-
-    def _responsible(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
-        p, columns = self.config.predictors, encoding.columns
-        cell = cell_of(box, encoding.rows, columns, self.config.stride)
-        region = (cell[:, None] * p + torch.arange(p)).flatten()
-        own = self._boxes(encoding, row.repeat_interleave(p), region).unflatten(0, (-1, p))
-        return cell * p + box_iou(own, box[:, None]).argmax(-1)
 
     @cached_property
     def _category_extents(self) -> Float[np.ndarray, "labels 3"]:

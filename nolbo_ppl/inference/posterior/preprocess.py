@@ -16,6 +16,8 @@ from nolbo_ppl.errors import input_error
 
 Image = UInt8[np.ndarray, "h w 3"] | UInt8[Tensor, "3 h w"]
 """An image: a uint8 array of height x width x 3 colours, or a torch tensor with the colours first."""
+PADDING = 114
+"""Grey value of the bars beside an image."""
 LEAST_SIDE = 8
 """Least height and width of an image, px."""
 
@@ -40,7 +42,9 @@ def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "
 
 
 def prepare(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> Prepared:
-    """Scale an image so that its longer side has the wanted size and both are multiples of 32.
+    """Scale an image uniformly so that its longer side has the wanted size; grey bars make both multiples of 32.
+
+    The rule of training (`nolbo_ppl.data.folder.letterbox`), with bars on the right and below, so that pixels keep their place.
 
     Args:
         image: see `Image`.
@@ -66,12 +70,15 @@ def prepare(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.f
         if camera.shape != (4,) or not np.isfinite(camera).all() or (camera[:2] <= 0).any():
             raise input_error("intrinsics", got=intrinsics, expected="[fx, fy, cx, cy] in px with positive fx, fy")
     factor = size / max(height, width)
-    new = [max(32, round(side * factor / 32) * 32) for side in (width, height)]
+    new = [max(1, round(side * factor)) for side in (width, height)]
     if [width, height] != new:
         from PIL import Image as PillowImage
 
         image = np.asarray(PillowImage.fromarray(image).resize((new[0], new[1]), PillowImage.Resampling.BILINEAR))
     scale = np.array([new[0] / width, new[1] / height])
+    bars = [-side % 32 for side in new]
+    if any(bars):
+        image = np.pad(image, ((0, bars[1]), (0, bars[0]), (0, 0)), constant_values=PADDING)
     tensor = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
     return Prepared(tensor, torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype), scale)
 

@@ -93,4 +93,5 @@ def assemble(
 ) -> Arrays:
     """The fields of `nolbo_ppl.inference.batch.SceneBatch` as arrays; `labels` includes `viewpoint`."""
     batch = {name: labels[name] for name in ("intrinsics", "viewpoint", *_LAYOUT) if name != "rotation"}
+    batch |= {name: labels[name] for name in ("ignore", "exhaustive") if name in labels}
     return {"image": images, **batch, "voxels": voxels, "has_voxels": has_voxels}

@@ -1,0 +1,79 @@
+"""A second look at objects cut out of the image at one size, and sent through the encoder once more.
+
+An encoder learns an object's viewpoint and shape at the sizes it has seen, and knows little at others: the share of cars of
+photographs whose azimuth the scene network knows within 30 degrees is .82 where they are 90 px large, .46 at 360 px. Cut
+out, near and far objects look alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nolbo_ppl.models.roi_refinement import sample_map
+
+SIDE = 112
+"""Height and width of a crop, px."""
+BOX_SIDE = 88.0
+"""Longer side of the object's box in it, px."""
+LEAST_SIDE = 8.0
+"""Boxes smaller than this, px, are looked at as if they were of this size."""
+LEVELS = 4
+"""The image and its halves, quarters and eighths: a large object is cut from where it is nearest to the crop's size."""
+
+
+@dataclass
+class Crops:
+    """Objects cut out of images."""
+
+    image: Float[Tensor, "n 3 side side"]
+    box: Float[Tensor, "n 4"]
+    """Their boxes in the crops, px; the centre lies in the middle."""
+    factor: Float[Tensor, " n"]
+    """Pixels of the crop over those of the image."""
+
+
+def image_levels(image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
+    """The image, and its means over blocks of 2, 4, ... px."""
+    levels = [image]
+    while len(levels) < LEVELS and min(levels[-1].shape[2:]) >= 2:
+        levels.append(torch.nn.functional.avg_pool2d(levels[-1], 2))
+    return tuple(levels)
+
+
+def cut_out(levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Crops:
+    """Cut objects out so that each box has the same longer side, its centre in the middle; beyond the image its border goes on.
+
+    Args:
+        levels: see `image_levels`.
+        row: the image of each object.
+        box: where it is, [x0, y0, x1, y1], px of the image.
+    """
+    centre = (box[:, :2] + box[:, 2:]) / 2
+    extent = (box[:, 2:] - box[:, :2]).clamp_min(1e-3)
+    factor = BOX_SIDE / extent.amax(-1).clamp_min(LEAST_SIDE)
+    level = (-torch.log2(factor)).round().long().clamp(0, len(levels) - 1)
+    step = torch.arange(SIDE, dtype=box.dtype) + 0.5 - SIDE / 2
+    y, x = torch.meshgrid(step, step, indexing="ij")
+    offset = torch.stack((x, y), -1).flatten(0, 1)
+    image = box.new_zeros(len(box), SIDE * SIDE, 3, dtype=levels[0].dtype)
+    for number, pixels in enumerate(levels):
+        chosen = (level == number).nonzero().squeeze(-1)
+        if len(chosen):
+            points = centre[chosen, None] + offset / factor[chosen, None, None]
+            image[chosen] = sample_map(pixels, row[chosen], points, 2**number)
+    half = extent * (factor[:, None] / 2)
+    middle = torch.full_like(half, SIDE / 2)
+    crop = image.transpose(1, 2).unflatten(-1, (SIDE, SIDE)).contiguous(memory_format=torch.channels_last)
+    return Crops(crop, torch.cat((middle - half, middle + half), -1), factor)
+
+
+def range_shift(factor: Float[Tensor, " n"], spread: float) -> Float[Tensor, " n"]:
+    """What is added to the range latent of crops to make it that of the image.
+
+    The latent holds log(range / pixels per radian), and a crop has `factor` times the image's pixels per radian.
+    """
+    return factor.log() / spread

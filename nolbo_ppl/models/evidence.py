@@ -1,0 +1,187 @@
+"""Evidence about objects, re-binned into the guide's own regions, and the small network that weighs it.
+
+Two sources answer for every image: a detector that knows photographs, and the guide's own scene network, which knows
+generated scenes. Every prediction of a source goes to the cell that holds the centre of its box; of those below 48 px
+the best is the cell's first predictor's, of those above the best is its second predictor's, the roles that the
+predictors of the scene network have. What a region then says (objectness, category, box) is the detector's evidence plus what
+the fusion network learns to change in it: nothing before any training.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from nolbo_ppl.geometry.boxes import box_iou
+from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.layers import OutputLinear
+from nolbo_ppl.models.scene_batch import cell_of, encode_box
+from nolbo_ppl.models.yolox import CLASSES, Predictions
+
+ROLE_SIDE = 48.0
+"""Longer side, px, from which on a box belongs to a cell's second predictor."""
+COCO_LABELS = {
+    "aeroplane": 4, "bicycle": 1, "boat": 8, "bottle": 39, "bus": 5, "car": 2, "chair": 56, "diningtable": 60,
+    "motorbike": 3, "sofa": 57, "train": 6, "tvmonitor": 62,
+}  # fmt: skip
+"""Number of each category among COCO's."""
+TRUCK = 7
+"""COCO's trucks: what the detector says of a quarter of all vans, kept apart from the cars' evidence."""
+LEAST_LOG = -9.0
+"""Log odds and log probabilities below this are as good as none."""
+
+
+@dataclass
+class Evidence:
+    """What one source says of every region of a batch of images."""
+
+    found: Float[Tensor, "b k"]
+    """1 where it says anything."""
+    log_odds: Float[Tensor, "b k"]
+    """That the region describes an object; `LEAST_LOG` where it says nothing."""
+    labels: Float[Tensor, "b k l"]
+    """Log probability of each category, and of others that the source knows."""
+    box: Float[Tensor, "b k 4"]
+    """[x0, y0, x1, y1], px of the image; a box of a stride's side at the cell where it says nothing."""
+    features: Float[Tensor, "b k f"]
+    """Its features there."""
+
+
+def bin_best(
+    box: Float[Tensor, "b n 4"], score: Float[Tensor, "b n"], rows: int, columns: int, config: ModelConfig
+) -> tuple[Int[Tensor, "b k"], Tensor]:
+    """Row of the best prediction of each region, and whether there is one.
+
+    Args:
+        box: boxes of all predictions, px.
+        score: their scores.
+        rows: cells above each other.
+        columns: cells side by side.
+        config: stride and predictors; with one predictor all sizes share it.
+    """
+    role = ((box[..., 2:] - box[..., :2]).amax(-1) >= ROLE_SIDE).long().clamp(max=config.predictors - 1)
+    region = cell_of(box, rows, columns, config.stride) * config.predictors + role
+    regions = rows * columns * config.predictors
+    best = score.new_full((len(box), regions), -torch.inf).scatter_reduce(1, region, score, "amax")
+    winner = score == best.gather(1, region)
+    index = region.new_full((len(box), regions + 1), -1)
+    number = torch.arange(box.shape[1]).expand(len(box), -1)
+    index.scatter_(1, torch.where(winner, region, regions), number)
+    index = index[:, :regions]
+    return index.clamp_min(0), index >= 0
+
+
+def gather_evidence(
+    box: Float[Tensor, "b n 4"], log_odds: Float[Tensor, "b n"], labels: Float[Tensor, "b n l"],
+    features: Float[Tensor, "b n f"], rows: int, columns: int, config: ModelConfig,
+) -> Evidence:
+    """The predictions of a source as evidence about regions (module's docstring)."""
+    with torch.no_grad():
+        index, found = bin_best(box.detach(), log_odds.detach(), rows, columns, config)
+
+    def at(values: Tensor) -> Tensor:
+        return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+
+    cell = torch.arange(rows * columns).repeat_interleave(config.predictors)
+    x, y = (cell % columns + 0.5) * config.stride, (cell // columns + 0.5) * config.stride
+    half = config.stride / 2
+    empty = torch.stack((x - half, y - half, x + half, y + half), -1).to(box.dtype)
+    seen = found[..., None]
+    return Evidence(
+        found.to(box.dtype),
+        torch.where(found, log_odds.gather(1, index), LEAST_LOG).clamp_min(LEAST_LOG),
+        torch.where(seen, at(labels), -math.log(labels.shape[-1])).clamp_min(LEAST_LOG),
+        torch.where(seen, at(box), empty),
+        torch.where(seen, at(features), 0.0),
+    )
+
+
+def detector_evidence(predictions: Predictions, rows: int, columns: int, config: ModelConfig) -> Evidence:
+    """The detector's predictions by region; labels are the categories', then trucks, then the best of all others."""
+    own = [COCO_LABELS[name] for name in config.categories]
+    rest = [label for label in range(CLASSES) if label not in (*own, TRUCK)]
+    with torch.no_grad():
+        of_class = nn.functional.logsigmoid(predictions.classes)
+        known = of_class[..., own]
+        labels = torch.cat((known, of_class[..., [TRUCK]], of_class[..., rest].amax(-1, keepdim=True)), -1)
+        joint = (nn.functional.logsigmoid(predictions.objectness) + known.amax(-1)).clamp(max=-1e-6)
+        log_odds = joint - torch.log(-torch.expm1(joint))
+    return gather_evidence(predictions.box, log_odds, labels, predictions.features, rows, columns, config)
+
+
+@dataclass
+class Fused:
+    """What the evidence together says of every region."""
+
+    objectness_logit: Float[Tensor, "b k"]
+    label_logits: Float[Tensor, "b k labels"]
+    look_weight: Float[Tensor, "b k"]
+    """Weight of the label logits of the second look."""
+    box_loc: Float[Tensor, "b k 4"]
+    """Mean of the box latent."""
+    box_raw: Float[Tensor, "b k 4"]
+    """Raw scales of the box latent, as the head's."""
+
+
+class Fusion(nn.Module):
+    """Detector's and scene network's evidence -> objectness, category and box of every region.
+
+    Args:
+        features: channels of the detector's features.
+        context: numbers that describe an image as a whole.
+        config: categories, predictors.
+    """
+
+    def __init__(self, features: int, context: int, config: ModelConfig) -> None:
+        super().__init__()
+        self.config, labels = config, len(config.categories)
+        self.context = nn.Sequential(nn.LayerNorm(context), nn.Linear(context, 16), nn.LayerNorm(16), nn.Tanh())
+        self.feature_norm = nn.LayerNorm(features)
+        inputs = (labels + 2) + labels + features + 16 + 2 + 2 + 4 + 1
+        self.slope = nn.Parameter(torch.ones(()))
+        self.shift = nn.Parameter(torch.zeros(()))
+        self.sizes = (1, labels, 3, 1, 4, 4)
+        last = OutputLinear(64, sum(self.sizes))
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.weigh = nn.Sequential(nn.Linear(inputs, 96), nn.GELU(), nn.Linear(96, 64), nn.GELU(), last)
+
+    def forward(
+        self, detector: Evidence, scene: Evidence, context: Float[Tensor, "b c"], columns: int
+    ) -> Fused:
+        """Weigh the evidence about every region of a batch of images, `columns` cells wide."""
+        config = self.config
+        inputs = torch.cat(
+            (
+                detector.labels / 4, scene.labels / 4, self.feature_norm(detector.features),
+                self.context(context)[:, None].expand(-1, detector.found.shape[1], -1),
+                torch.stack((detector.log_odds / 4, scene.log_odds / 4, detector.found, scene.found), -1),
+                _log_size(detector.box), _log_size(scene.box), box_iou(detector.box, scene.box)[..., None],
+            ),
+            -1,
+        )  # fmt: skip
+        objectness, label, weight, mix, shift, scale = self.weigh(inputs).split(self.sizes, -1)
+        labels = len(config.categories)
+        cell = torch.arange(detector.found.shape[1]) // config.predictors
+        cell = cell.expand(len(detector.found), -1)
+        share = torch.where(
+            scene.found[..., None] == 0, 1.0, torch.where(detector.found[..., None] == 0, 0.0, torch.sigmoid(mix + 3.0))
+        )
+        box = torch.lerp(
+            encode_box(scene.box, cell, columns, config), encode_box(detector.box, cell, columns, config), share
+        )
+        return Fused(
+            self.slope * detector.log_odds + self.shift + objectness[..., 0],
+            (1 + weight[..., :1]) * detector.labels[..., :labels] + weight[..., 1:2] * scene.labels + label,
+            torch.tanh(weight[..., 2]),
+            box + 0.3 * shift,
+            scale,
+        )
+
+
+def _log_size(box: Float[Tensor, "b k 4"]) -> Float[Tensor, "b k 2"]:
+    return ((box[..., 2:] - box[..., :2]).clamp_min(1.0) / 64.0).log()
