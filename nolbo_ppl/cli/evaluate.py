@@ -7,10 +7,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from tqdm import tqdm
 
 from nolbo_ppl._version import __version__
@@ -19,6 +20,8 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.evaluation.instance_views import InstanceViews
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes, GeneratedScenes, Scenes
 from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
+from nolbo_ppl.evaluation.peers import OnnxPeer
+from nolbo_ppl.evaluation.photographs import PhotographEvaluation, PhotographScenes, evaluate_photographs
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords, concatenate
 from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
 from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, figures
@@ -45,8 +48,15 @@ class EvaluateConfig:
     """Name of shipped weights, or a folder with model.safetensors and config.json."""
     scenes: Path | None = None
     """Folder of labelled scenes (scenes.jsonl); without it scenes are generated."""
+    photographs: Path | None = None
+    """Labelled photographs in place of scenes: a COCO-style JSON file, or a folder with `val.json`; images lie in the folder
+    `images` beside it. An image may name the categories it labels `exhaustive`ly, an annotation be `difficult` or have an
+    `azimuth`, degrees."""
+    peer: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """ONNX file of a detector (YOLOX or PicoDet, COCO's categories) to measure on the same photographs; may be given several
+    times (extra `detector`)."""
     count: int = 500
-    """Scenes to generate, or at most to read."""
+    """Scenes to generate, or at most to read; of photographs, all are read unless a smaller number is given."""
     seed: int = SEED
     """Seed of the generated scenes and their shapes."""
     difficulty: Literal["easy", "standard", "full"] = "standard"
@@ -239,6 +249,10 @@ def _number(value: float | None) -> str:
 
 def run(config: EvaluateConfig) -> Evaluation:
     """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`."""
+    if config.photographs is not None:
+        raise input_error("photographs have a run of their own", do="call run_photographs")
+    if config.peer:
+        raise input_error("a peer without photographs", got=config.peer, do="give --photographs too")
     loaded = load(config.model)
     model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
     scenes = open_scenes(config, model.config)
@@ -254,6 +268,86 @@ def run(config: EvaluateConfig) -> Evaluation:
     if config.pictures:
         _draw(evaluation, values, scenes, model, config.out)
     return evaluation
+
+
+def run_photographs(config: EvaluateConfig) -> PhotographEvaluation:
+    """Measure the model and its peers on photographs; write `metrics.json` and, unless switched off, pictures and
+    `index.html` into `config.out`.
+
+    Raises:
+        InputError: the photographs, or a peer's file, cannot be used, or scenes are asked for too.
+    """
+    if config.photographs is None or config.scenes is not None or config.cad is not None:
+        raise input_error("photographs and scenes in one evaluation", do="give --photographs alone")
+    loaded = load(config.model)
+    model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
+    peers = [OnnxPeer(path, model.config.categories) for path in config.peer]
+    count = None if config.count == EvaluateConfig.count else config.count
+    evaluation = evaluate_photographs(
+        config.photographs,
+        model,
+        peers,
+        threshold=config.threshold,
+        batch=config.batch,
+        count=count,
+        seed=config.seed,
+        resamples=config.resamples,
+    )
+    values = photograph_metrics(evaluation, config, model.config.categories)
+    write_json(config.out / "metrics.json", values)
+    if config.pictures:
+        from nolbo_ppl.viz.detection_plots import write_detections
+        from nolbo_ppl.viz.evaluation_page import write_page
+
+        scenes, picture = PhotographScenes(evaluation.photos), config.out / "detections.png"
+        write_detections(evaluation.scores.pooled, scenes, model, picture)
+        write_page(values, [picture], config.out / "index.html")
+    return evaluation
+
+
+def photograph_metrics(evaluation: PhotographEvaluation, config: EvaluateConfig, categories: Sequence[str]) -> dict[str, Any]:
+    """The content of metrics.json of photographs."""
+    scores = evaluation.scores
+    columns = ("photographs", "objects", "ap50", "category_found")
+    tables = {**scores.by_source, **scores.by_size}
+    configuration = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()}
+    configuration |= {"scenes": str(config.photographs), "peer": [str(path) for path in config.peer]}
+    models = {str(config.model): scores, **evaluation.peers}
+    names = list(dict.fromkeys(name for one in models.values() for name in one.figures))
+    values = {name: [one.figures[name].value if name in one.figures else None for one in models.values()] for name in names}
+    return {
+        **{name: one.value for name, one in scores.figures.items()},
+        "intervals": {name: None if one.low is None else [one.low, one.high] for name, one in scores.figures.items()},
+        "counts": {name: one.count for name, one in scores.figures.items()},
+        "images_per_second": evaluation.images_per_second,
+        "scenes": len(evaluation.photos),
+        "objects": int(scores.pooled.truths.sum()),
+        "by_category": scores.by_category,
+        "by_difficulty": {name: {column: row.get(column) for column in columns} for name, row in tables.items()},
+        "peers": {model: {name: values[name][k] for name in names} for k, model in enumerate(models)},
+        "categories": list(categories),
+        "configuration": configuration,
+        "versions": {"nolbo_ppl": __version__, "python": platform.python_version(), "torch": torch.__version__},
+    }
+
+
+def photograph_table(evaluation: PhotographEvaluation, model: str) -> str:
+    """The figures of the model and its peers with their 95 % intervals, as text."""
+    models = {model: evaluation.scores, **evaluation.peers}
+    lines = [f"{'figure':<24}" + "".join(f"{name[:28]:>30}" for name in models) + f"{'of':>8}"]
+    for name, one in evaluation.scores.figures.items():
+        cells = []
+        for scores in models.values():
+            found = scores.figures.get(name)
+            interval = "" if found is None or found.low is None else f" [{found.low:.3f}, {found.high:.3f}]"
+            cells.append(f"{_number(None if found is None else found.value)}{interval}")
+        lines.append(f"{name:<24}" + "".join(f"{cell:>30}" for cell in cells) + f"{one.count:>8}")
+    lines += ["", f"{'ap50 of':<32}" + "".join(f"{name[:14]:>16}" for name in models) + f"{'objects':>9}"]
+    for kind in ("by_source", "by_size", "by_category"):
+        for name, row in getattr(evaluation.scores, kind).items():
+            values = [getattr(scores, kind)[name]["ap50"] for scores in models.values()]
+            lines.append(f"{name:<32}" + "".join(f"{_number(value):>16}" for value in values) + f"{row['objects']:>9}")
+    return "\n".join([*lines, "", f"{evaluation.images_per_second:.1f} photographs a second"])
 
 
 def _draw(
@@ -276,10 +370,12 @@ def _draw(
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line: parse the options, run, print the figures."""
-    import tyro
-
     config = tyro.cli(EvaluateConfig, args=args, prog="nolbo evaluate", description=__doc__)
-    sys.stdout.write(table(run(config)) + f"\n\nwritten to {config.out}\n")
+    if config.photographs is not None:
+        text = photograph_table(run_photographs(config), config.model)
+    else:
+        text = table(run(config))
+    sys.stdout.write(text + f"\n\nwritten to {config.out}\n")
 
 
 if __name__ == "__main__":

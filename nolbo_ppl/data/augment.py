@@ -161,12 +161,13 @@ def _move(
     intrinsics = torch.cat((batch.intrinsics[:, :2] * factor, batch.intrinsics[:, 2:] * factor + constant), -1)
     ignore = batch.ignore
     if ignore is not None:
-        ignore = torch.minimum(
-            (ignore * factor.repeat(1, 2)[:, None] + constant.repeat(1, 2)[:, None]).clamp_min(0), limit
-        )
+        ignore = torch.minimum((ignore * factor.repeat(1, 2)[:, None] + constant.repeat(1, 2)[:, None]).clamp_min(0), limit)
     moved = batch.replace(
         ignore=ignore,
-        box=torch.where(present[..., None], box, safe), present=present, visibility=visibility, intrinsics=intrinsics
+        box=torch.where(present[..., None], box, safe),
+        present=present,
+        visibility=visibility,
+        intrinsics=intrinsics,
     )
     return moved, image
 

@@ -3,8 +3,9 @@
 A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objects": [...]}`; an object is
 `{"box": [x0, y0, x1, y1] px, "category", "instance", "rotation": [qx, qy, qz, qw] of R_camera_object, "position":
 [x, y, z] m of the box centre in the camera frame, "size": m (box diagonal), "dimensions": [3] m, "visibility",
-"symmetry"}`. A line may have `"ignore"`, boxes of parts of the image that are not labelled, and `"exhaustive"`, the
-categories of which every instance is labelled (all of them when it is missing). Only `image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
+"symmetry"}`. A line may have `"ignore"`, boxes of parts of the image that are
+not labelled, and `"exhaustive"`, the categories of which every instance is labelled (all of them when it is missing). Only
+`image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
 """
 
 from __future__ import annotations

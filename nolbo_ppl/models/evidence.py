@@ -17,8 +17,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nolbo_ppl.geometry.boxes import box_iou
-from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.layers import OutputLinear
+from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.scene_batch import cell_of, encode_box
 from nolbo_ppl.models.yolox import CLASSES, Predictions
 
@@ -76,8 +76,13 @@ def bin_best(
 
 
 def gather_evidence(
-    box: Float[Tensor, "b n 4"], log_odds: Float[Tensor, "b n"], labels: Float[Tensor, "b n l"],
-    features: Float[Tensor, "b n f"], rows: int, columns: int, config: ModelConfig,
+    box: Float[Tensor, "b n 4"],
+    log_odds: Float[Tensor, "b n"],
+    labels: Float[Tensor, "b n l"],
+    features: Float[Tensor, "b n f"],
+    rows: int,
+    columns: int,
+    config: ModelConfig,
 ) -> Evidence:
     """The predictions of a source as evidence about regions (module's docstring)."""
     with torch.no_grad():
@@ -150,9 +155,7 @@ class Fusion(nn.Module):
         nn.init.zeros_(last.bias)
         self.weigh = nn.Sequential(nn.Linear(inputs, 96), nn.GELU(), nn.Linear(96, 64), nn.GELU(), last)
 
-    def forward(
-        self, detector: Evidence, scene: Evidence, context: Float[Tensor, "b c"], columns: int
-    ) -> Fused:
+    def forward(self, detector: Evidence, scene: Evidence, context: Float[Tensor, "b c"], columns: int) -> Fused:
         """Weigh the evidence about every region of a batch of images, `columns` cells wide."""
         config = self.config
         inputs = torch.cat(
@@ -171,9 +174,7 @@ class Fusion(nn.Module):
         share = torch.where(
             scene.found[..., None] == 0, 1.0, torch.where(detector.found[..., None] == 0, 0.0, torch.sigmoid(mix + 3.0))
         )
-        box = torch.lerp(
-            encode_box(scene.box, cell, columns, config), encode_box(detector.box, cell, columns, config), share
-        )
+        box = torch.lerp(encode_box(scene.box, cell, columns, config), encode_box(detector.box, cell, columns, config), share)
         return Fused(
             self.slope * detector.log_odds + self.shift + objectness[..., 0],
             (1 + weight[..., :1]) * detector.labels[..., :labels] + weight[..., 1:2] * scene.labels + label,

@@ -153,9 +153,7 @@ class Guide(nn.Module):
         raw = raw.index_put((row, slot), refined.to(raw.dtype))
         return self.head.parameters_of(raw, self._prior().label_mean())
 
-    def responsible_region(
-        self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
-    ) -> Int[Tensor, " n"]:
+    def responsible_region(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
         """Region responsible for each given box: in its cell the predictor whose own box overlaps it most (NOLBO,
         implementation)."""
         p, columns = self.config.predictors, encoding.columns

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from nolbo_ppl.geometry.boxes import box_area, box_iou
 from nolbo_ppl.models.backbones import check_image, normalise_image
-from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.crops import SIDE, cut_out, image_levels, range_shift
 from nolbo_ppl.models.evidence import ROLE_SIDE, Fused, Fusion, detector_evidence, gather_evidence
 from nolbo_ppl.models.guide import Encoding, Guide, ObservedScene
 from nolbo_ppl.models.head import RegionParameters
+from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
@@ -97,7 +97,11 @@ class HybridGuide(Guide):
         return HybridEncoding(features, fused.objectness_logit, rows, columns, (), fused, box, levels)
 
     def parameters_at(
-        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], look: bool = True,
+        self,
+        encoding: Encoding,
+        row: Int[Tensor, " n"],
+        region: Int[Tensor, " n"],
+        look: bool = True,
         box: Float[Tensor, "n 4"] | None = None,
     ) -> RegionParameters:
         """Posterior parameters of given regions; see `Guide.parameters_at`."""
@@ -106,7 +110,11 @@ class HybridGuide(Guide):
         return self.head.parameters_of(raw, self._prior().label_mean())
 
     def _look(
-        self, encoding: HybridEncoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], look: bool = True,
+        self,
+        encoding: HybridEncoding,
+        row: Int[Tensor, " n"],
+        region: Int[Tensor, " n"],
+        look: bool = True,
         box: Float[Tensor, "n 4"] | None = None,
     ) -> Float[Tensor, "n outputs"]:
         """Raw outputs of regions: of the second look, with category and box of the evidence."""
@@ -117,7 +125,7 @@ class HybridGuide(Guide):
         label_size, _, _, _, box_size, _ = self.head.sizes
         first = sum(self.head.sizes[:4])
         if not look or len(row) == 0:
-            start = self.head.start[-1].to(dtype).expand(len(row), -1)
+            start = self.head.get_buffer("start")[-1].to(dtype).expand(len(row), -1)
             return torch.cat((labels, start[:, label_size:first], located, start[:, first + box_size :]), -1)
         with torch.no_grad():
             crops = cut_out(encoding.levels, row, (encoding.box[row, region] if box is None else box).detach())
@@ -132,9 +140,7 @@ class HybridGuide(Guide):
         seen = fused.look_weight[row, region][:, None] * torch.log_softmax(raw[:, :label_size], -1)
         return torch.cat((labels + seen, raw[:, label_size:first], located, ranges), -1)
 
-    def responsible_region(
-        self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
-    ) -> Int[Tensor, " n"]:
+    def responsible_region(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
         """Region that describes each box best: the largest overlap, the likelier of like ones."""
         assert isinstance(encoding, HybridEncoding) and encoding.box is not None
         own, logit = encoding.box[row], encoding.objectness_logit[row]
@@ -171,14 +177,18 @@ class HybridGuide(Guide):
             at = region[row, slot]
             found = overlap[row, slot] >= SAME_OBJECT  # where an object is not found, the look is taken where it is
             box = torch.where(found[:, None], encoding.box[row, at], batch.box[row, slot])
-        raw = self.head.start[-1].to(encoding.objectness_logit).expand(*region.shape, -1)
+        raw = self.head.get_buffer("start")[-1].to(encoding.objectness_logit).expand(*region.shape, -1)
         raw = raw.index_put((row, slot), self._look(encoding, row, at, True, box))
         posterior = self.head.parameters_of(raw, self._prior().label_mean())
         return ObservedScene(batch, encoding, assignment, posterior)
 
 
 def region_quality(
-    own: Float[Tensor, "b k 4"], logit: Float[Tensor, "b k"], box: Float[Tensor, "b m 4"], rows: int, columns: int,
+    own: Float[Tensor, "b k 4"],
+    logit: Float[Tensor, "b k"],
+    box: Float[Tensor, "b m 4"],
+    rows: int,
+    columns: int,
     config: ModelConfig,
 ) -> tuple[Float[Tensor, "b m k"], Float[Tensor, "b m k"]]:
     """How well each region describes each box, and their overlap.
@@ -194,8 +204,13 @@ def region_quality(
 
 
 def assign_regions(
-    own: Float[Tensor, "b k 4"], logit: Float[Tensor, "b k"], box: Float[Tensor, "b m 4"], present: Bool[Tensor, "b m"],
-    rows: int, columns: int, config: ModelConfig,
+    own: Float[Tensor, "b k 4"],
+    logit: Float[Tensor, "b k"],
+    box: Float[Tensor, "b m 4"],
+    present: Bool[Tensor, "b m"],
+    rows: int,
+    columns: int,
+    config: ModelConfig,
 ) -> tuple[Int[Tensor, "b m"], Bool[Tensor, "b m"], Float[Tensor, "b m"]]:
     """Responsible region of each object, whether it has one, and the overlap of their boxes.
 
@@ -216,9 +231,7 @@ def assign_regions(
     return region, present.clone(), overlap.gather(2, region[..., None])[..., 0]
 
 
-def known_regions(
-    own: Float[Tensor, "b k 4"], labels: Float[Tensor, "b k l"], batch: SceneBatch
-) -> Bool[Tensor, "b k"]:
+def known_regions(own: Float[Tensor, "b k 4"], labels: Float[Tensor, "b k l"], batch: SceneBatch) -> Bool[Tensor, "b k"]:
     """Regions that are known to be background, where they are responsible for no object.
 
     Unknown are regions that describe an object for which another is responsible, those half of whose box lies in a part of

@@ -128,7 +128,8 @@ class ModelConfig:
             )
         if self.detector and (self.encoder != "tiny" or self.instances or not self.glimpse):
             raise input_error(
-                "a detector beside the encoder", got=f"encoder {self.encoder}, glimpse {self.glimpse}",
+                "a detector beside the encoder",
+                got=f"encoder {self.encoder}, glimpse {self.glimpse}",
                 expected="the tiny encoder with a second look, no instance labels",
             )
         if self.image_size % 32 or self.image_size <= 0:

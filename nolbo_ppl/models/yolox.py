@@ -189,7 +189,9 @@ class YoloxNano(nn.Module):
             centre = (box[..., :2] + corner) * stride
             half = box[..., 2:].clamp(max=8).exp() * (stride / 2)
             boxes.append(torch.cat((centre - half, centre + half), -1))
-            objectness.append(obj.squeeze(-1)), classes.append(cls), features.append(feature)
+            objectness.append(obj.squeeze(-1))
+            classes.append(cls)
+            features.append(feature)
         joined = [torch.cat(part, 1).to(image.dtype) for part in (objectness, classes, features)]
         return Predictions(torch.cat(boxes, 1), *joined)
 

@@ -276,7 +276,7 @@ def join_batches(batches: Sequence[SceneBatch]) -> SceneBatch:
                 value = value.float()
             parts.append(value)
         absent = any(part is None for part in parts) or (field.name == "exhaustive" and not labels)
-        absent |= field.name.startswith("shape_") and not latent or field.name == "ignore" and not regions
+        absent |= (field.name.startswith("shape_") and not latent) or (field.name == "ignore" and not regions)
         joined[field.name] = None if absent else torch.cat(parts)
     if any(batch.voxels.shape[2] != voxels for batch in batches):
         raise input_error("voxels of data sets to mix", got=[batch.voxels.shape[2] for batch in batches], expected="one size")

@@ -17,7 +17,7 @@ from nolbo_ppl.data.scene_cache import write_cache
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
-from nolbo_ppl.synthetic.scenes.scene_config import rendered_size
+from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
@@ -91,9 +91,10 @@ class TrainingData:
         self.single = self.train
         if config.single_steps:
             base = self._sources(config.seed)[0].config
-            single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))  # type: ignore[type-var]
+            assert isinstance(base, SceneConfig)  # views of worlds come last
+            single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
             behind = None if config.difficulty == "mixed" or config.backgrounds is None else str(config.backgrounds)
-            source = SceneSource(single, config.seed, backgrounds=behind)  # type: ignore[arg-type]
+            source = SceneSource(single, config.seed, backgrounds=behind)
             self.single = self._cached([source], config.single_count)
         if self.world > 1 and self.rank == 0:
             distributed.barrier()
@@ -128,9 +129,7 @@ class TrainingData:
         if self.config.instance_labels:
             number, _, category = folder.shapes()
             names = tuple(folder.instances[n] for n in number)
-            self.model = dataclasses.replace(
-                self.model, instances=names, instance_category=tuple(int(c) for c in category)
-            )
+            self.model = dataclasses.replace(self.model, instances=names, instance_category=tuple(int(c) for c in category))
             others = tuple(name for name in folder.instances if name not in set(names))
             folder = SceneFolder(path, self.model.categories, names + others, size=size, symmetry=self.model.symmetry)
             known = len(names)
@@ -186,8 +185,9 @@ class TrainingData:
         """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
         parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
         for scenes, table in parts:
-            supply = SceneSupply(scenes, table, 64, 0, self.model.latent_dim, size=self.model.image_size,
-                                 known_instances=len(self.model.instances))
+            supply = SceneSupply(
+                scenes, table, 64, 0, self.model.latent_dim, size=self.model.image_size, known_instances=len(self.model.instances)
+            )
             total = len(scenes) if count is None else min(-(-count // len(parts)), len(scenes))
             step = 64 if self.model.image_size <= 256 else 16
             for first in range(0, total, step):

@@ -134,8 +134,11 @@ class TrainConfig:
         if isinstance(self.scenes, str | Path) or self.scenes is None:
             object.__setattr__(self, "scenes", () if not self.scenes else (Path(self.scenes),))
         if self.mix and len(self.mix) - len(self.scenes) not in (0, 1):
-            raise input_error("mix", got=f"{len(self.mix)} shares of {len(self.scenes)} folders",
-                              expected="a share of each of --scenes, and one more for generated scenes if they are wanted")
+            raise input_error(
+                "mix",
+                got=f"{len(self.mix)} shares of {len(self.scenes)} folders",
+                expected="a share of each of --scenes, and one more for generated scenes if they are wanted",
+            )
         if any(share <= 0 for share in self.mix):
             raise input_error("mix", got=self.mix, expected="positive shares")
         if any(size % 32 or size <= 0 for size in self.render_sizes):

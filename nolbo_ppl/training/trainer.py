@@ -25,8 +25,8 @@ from nolbo_ppl.inference.posterior.model_folder import load, save
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
-from nolbo_ppl.training.detector_file import adopt
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
+from nolbo_ppl.training.detector_file import adopt
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.stage_data import TrainingData
 from nolbo_ppl.training.stages import StageRun

@@ -46,6 +46,13 @@ WORDS = {
     "median_range_error": "median relative error of the distance",
     "median_depth_error": "median relative error of the depth",
     "median_depth_error_known_size": "the same, the object's true size known",
+    "category_found": "category of the objects found",
+    "false_without_objects": "detections above 0.5 in an image without objects",
+    "viewpoint_found": "objects with a known azimuth that are found",
+    "azimuth_median_deg": "median error of the azimuth, degrees",
+    "azimuth_flips": "azimuth within 30° of the opposite one",
+    "azimuth_coverage90": "truths in the 90 % region: azimuth of the objects found",
+    "azimuth_acc_pi6_all": "azimuth within 30°, of all objects with a known one",
     "retrieval_recall1": "same instance found first (evidence ratio)",
     "retrieval_recall5": "same instance among the first five",
     "retrieval_recall1_overlap": "found first, by overlap of the posteriors",
@@ -91,6 +98,8 @@ def write_page(values: Mapping[str, Any], pictures: Sequence[Path], path: str | 
         "<h2>By difficulty</h2>",
         _rows("objects with", values["by_difficulty"]),
     ]
+    if len(values.get("peers") or ()) > 1:
+        parts += ["<h2>Beside other detectors</h2>", _rows("model", values["peers"])]
     if values.get("retrieval"):
         parts += ["<h2>The same instance, by category</h2>", _rows("category", values["retrieval"])]
     for name in [*(n for n in CAPTIONS if n in by_name), *(n for n in by_name if n not in CAPTIONS)]:

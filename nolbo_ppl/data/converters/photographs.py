@@ -62,7 +62,9 @@ def read_photographs(
     file = file / "val.json" if file.is_dir() else file
     folder = file.parent / "images" if images is None else Path(images)
     content = read_json(file)
-    if not isinstance(content, dict) or not all(isinstance(content.get(k), list) for k in ("images", "annotations", "categories")):
+    if not isinstance(content, dict) or not all(
+        isinstance(content.get(k), list) for k in ("images", "annotations", "categories")
+    ):
         raise input_error("not a COCO file", expected='{"images": [...], "annotations": [...], "categories": [...]}', file=file)
     label = {one["id"]: categories.index(one["name"]) for one in content["categories"] if one.get("name") in categories}
     of_image: dict[Any, list[dict[str, Any]]] = defaultdict(list)
@@ -146,9 +148,7 @@ def convert_photographs(
     return {"images": len(rows), "objects": objects, "viewpoints": oriented}
 
 
-def _rotation(
-    viewpoint: Float[np.ndarray, " 3"], box: Float[np.ndarray, " 4"], camera: Float[np.ndarray, " 4"]
-) -> list[float]:
+def _rotation(viewpoint: Float[np.ndarray, " 3"], box: Float[np.ndarray, " 4"], camera: Float[np.ndarray, " 4"]) -> list[float]:
     """Egocentric rotation (quaternion) of an allocentric viewpoint seen through the middle of a box."""
     slope = ((box[:2] + box[2:]) / 2 - camera[2:]) / camera[:2]
     ray = torch.tensor([[*slope.tolist(), 1.0]], dtype=torch.float64)

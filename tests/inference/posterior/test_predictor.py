@@ -229,16 +229,18 @@ def test_double_resolution_gives_the_same_metres() -> None:
     np.testing.assert_allclose(twice, 2 * (cosine / closer) ** 1.5 * distance)
 
 
-def test_anisotropic_scaling_of_odd_sizes() -> None:
-    """An image whose sides are no multiples of 32 is stretched; boxes come back in its own pixels, rays through them."""
+def test_bars_beside_images_of_odd_sizes() -> None:
+    """An image whose sides are no multiples of 32 gets grey bars; boxes come back in its own pixels, rays through them."""
     model = observer()
     image = np.full((50, 90, 3), 120, np.uint8)
     camera = [80.0, 80.0, 45.0, 25.0]
     found = model.observe(image, camera, threshold=0.3, iou_threshold=1.0, decode=False)
-    # the network saw 64 x 32: every cell's centre, decoded by hand and scaled back
-    scale = np.array([64 / 90, 32 / 50])
+    # the network saw 64 x 36 px and a bar below them: every cell's centre, decoded by hand and scaled back
+    scale = np.array([64 / 90, 36 / 50])
+    seen = torch.full((1, 3, 64, 64), 114, dtype=torch.uint8)
+    seen[:, :, :36] = 120
     with torch.no_grad():
-        encoding = model.model.guide.encode(torch.full((1, 3, 32, 64), 120, dtype=torch.uint8))
+        encoding = model.model.guide.encode(seen)
     region = int(encoding.objectness_logit[0].argmax())
     q = model.model.guide.parameters_at(encoding, torch.tensor([0]), torch.tensor([region]))
     box = decode_box(q.box_loc, torch.tensor([region // 2]), 4, model.config)
