@@ -18,10 +18,10 @@ from nolbo_ppl.geometry.boxes import box_area, box_iou
 from nolbo_ppl.models.backbones import check_image, normalise_image
 from nolbo_ppl.models.crops import SIDE, cut_out, image_levels, range_shift
 from nolbo_ppl.models.evidence import ROLE_SIDE, Fused, Fusion, detector_evidence, gather_evidence
-from nolbo_ppl.models.guide import Encoding, Guide, ObservedScene
-from nolbo_ppl.models.head import RegionParameters
+from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
+from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
 from nolbo_ppl.models.yolox import WIDTH, YoloxNano

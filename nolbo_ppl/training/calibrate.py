@@ -98,8 +98,9 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
     for batch in batches:
         scene = model.guide.observe(batch)
         where, q = scene.assignment, scene.posterior.at_mode(model.story.prior.label_mean())
-        add("logit", scene.encoding.objectness_logit.flatten())
-        add("is_object", where.is_object.flatten())
+        known = torch.ones_like(where.is_object) if where.counted is None else where.counted
+        add("logit", scene.encoding.objectness_logit[known])
+        add("is_object", where.is_object[known])
         mask = where.assigned & (batch.visibility >= 0.5)
         labelled = mask & (batch.category >= 0)
         add("label_logits", q.label_logits[labelled])
