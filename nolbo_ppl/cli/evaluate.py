@@ -21,7 +21,7 @@ from nolbo_ppl.evaluation.instance_views import InstanceViews
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes, GeneratedScenes, Scenes
 from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
 from nolbo_ppl.evaluation.peers import OnnxPeer
-from nolbo_ppl.evaluation.photographs import PhotographEvaluation, PhotographScenes, evaluate_photographs
+from nolbo_ppl.evaluation.photograph_run import PhotographEvaluation, PhotographScenes, evaluate_photographs
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords, concatenate
 from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
 from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, figures

@@ -111,7 +111,10 @@ def evaluate_photographs(
         started = time.perf_counter()
         found = model.observe(images, threshold=threshold, decode=False, batch=batch)
         seconds += time.perf_counter() - started
-        said = [PhotographAnswer(one.box, one.objectness, one.class_posterior, np.float64(one.viewpoint[:, 0])) for one in found]
+        said = [
+            PhotographAnswer(one.box, one.objectness, one.class_posterior, np.asarray(one.viewpoint[:, 0], dtype=np.float64))
+            for one in found
+        ]
         answers += said
         views.append(_viewpoints(model, first, chunk, images, said, batch))
     joined = Viewpoints(*(np.concatenate([getattr(v, name) for v in views]) for name in ("scene", "error", "mass", "found")))
