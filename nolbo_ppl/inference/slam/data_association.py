@@ -8,16 +8,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, transform
-from nolbo_ppl.inference.association import association_marginals_batch
-from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_features
+from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
-from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density, observed_modes, resolved_symmetry
-from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.measurements import Measurements
+from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 
 GATE = 25.0
 """Squared Mahalanobis distance beyond which a detection is no candidate for a landmark."""
+MAP_ROTATION = 0.02
+"""Standard deviation of each angle that the map's own orientation adds, rad."""
+LISTED = 1e-4
+"""Marginals below this are not listed."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class Associations:
 
 
 def associate_detections(
-    problem: SlamProblem,
+    measurements: Measurements,
     noise: NoiseModel,
     config: SlamConfig,
     prior: FeaturePrior,
@@ -52,63 +57,88 @@ def associate_detections(
 ) -> Associations:
     """Marginals of all detections over the landmarks of a map.
 
-    Detection k of frame t is landmark j with odds `q(o) N(x_k; x(T_t, l_j), S + relative covariance) ...`, a new object
-    with `q(o) lambda_new`, background with `(1 - q(o)) lambda_clutter`.
+    Detection k of frame t is landmark j with odds `p(score | object) N(x_k; x(T_t, l_j), S + relative covariance) ...`, a new
+    object with `p(score | object) lambda_new`, background with `p(score | clutter) lambda_clutter` (docs/em.md).
     """
-    table = problem.observations
-    n, m = len(table), len(estimate.T_world_landmark)
-    objectness = np.clip(table.objectness, *config.objectness_limits)
-    log_new = np.log(objectness) + np.log(noise.new_rate)
-    log_background = np.log1p(-objectness) + np.log(noise.clutter_rate)
-    log_null = np.logaddexp(log_new, log_background)
+    log_new = measurements.log_object + np.log(noise.new_rate)
+    log_clutter = measurements.log_clutter + np.log(noise.clutter_rate)
+    log_null = np.logaddexp(log_new, log_clutter)
     pose_delta, landmark_delta = linearisation.samples(min(config.samples, 48), rng)
-    rows, landmarks, square, log_det = _gated(problem, noise, estimate, pose_delta, landmark_delta)
-    value = np.log(objectness[rows]) - 0.5 * (square + log_det)
-    latent, variance, category = detection_features(table, noise, prior)
-    value += prior.pair_log_ratio(
-        latent[rows],
-        variance[rows],
-        category[rows],
+    rows, landmarks, square, log_det = _gated(measurements, estimate, pose_delta, landmark_delta)
+    value = measurements.log_object[rows] - 0.5 * (square + log_det)
+    value += feature_log_ratio(measurements, rows, landmarks, prior, config, estimate, features)
+    found = frame_marginals(measurements.frame, rows, landmarks, value, log_null, associator=config.associator)
+    listed = found.weight > LISTED
+    new = found.null * np.exp(log_new - log_null)
+    return Associations(
+        row=rows[listed],
+        landmark=landmarks[listed],
+        weight=found.weight[listed],
+        new=new,
+        background=np.maximum(found.null - new, 0.0),
+        log_evidence=found.log_evidence,
+        exact=found.exact,
+    )
+
+
+def feature_log_ratio(
+    measurements: Measurements,
+    rows: Int[np.ndarray, " p"],
+    landmarks: Int[np.ndarray, " p"],
+    prior: FeaturePrior,
+    config: SlamConfig,
+    estimate: SlamEstimate,
+    features: TrackletFeatures,
+) -> Float[np.ndarray, " p"]:
+    """Log ratio of the latent, category and orientation of detections given landmarks to those of any object, nats.
+
+    A pair without an orientation on both sides has no orientation term: the ratio is that to the uniform density.
+    """
+    seen = measurements
+    value = prior.pair_log_ratio(
+        seen.latent[rows],
+        seen.latent_variance[rows],
+        seen.category[rows],
         features.latent[landmarks],
         features.latent_variance[landmarks],
         features.category[landmarks],
     )
-    both = np.flatnonzero(table.has_rotation[rows] & features.oriented[landmarks])
+    both = np.flatnonzero(seen.oriented[rows] & features.oriented[landmarks])
     if len(both):
         k, j = rows[both], landmarks[both]
-        predicted = np.swapaxes(estimate.T_world_camera[table.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
-        scale = np.sqrt(noise.rotation_scale**2 + 0.02**2)
-        modes = observed_modes(table, scale, k)
-        value[both] += mixture_log_density(predicted, modes, resolved_symmetry(table, config)[k], config) - UNIFORM_LOG_DENSITY
-    return _marginals(table.frame, rows, landmarks, value, log_null, log_new, n, m, config)
+        predicted = np.swapaxes(estimate.T_world_camera[seen.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
+        modes = seen.modes.select(k)
+        modes = OrientationModes(modes.log_weight, modes.R, np.hypot(modes.scale, MAP_ROTATION))
+        value[both] += mixture_log_density(predicted, modes, seen.symmetry[k], config) - UNIFORM_LOG_DENSITY
+    return value
 
 
 def _gated(
-    problem: SlamProblem, noise: NoiseModel, estimate: SlamEstimate, pose_delta: np.ndarray, landmark_delta: np.ndarray
+    measurements: Measurements, estimate: SlamEstimate, pose_delta: np.ndarray, landmark_delta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Detection-landmark pairs inside the gate: rows, landmarks, squared distances and log determinants of 2 pi S."""
-    table = problem.observations
+    seen, T_world_camera = measurements, estimate.T_world_camera
     position = estimate.T_world_landmark[:, :3, 3]
-    world = transform(estimate.T_world_camera[table.frame], table.position)
+    world = transform(T_world_camera[seen.frame], seen.position)
     count = pose_delta.shape[2]
-    R_landmark, R_camera = estimate.T_world_landmark[:, :3, :3], estimate.T_world_camera[:, :3, :3]
+    R_landmark, R_camera = estimate.T_world_landmark[:, :3, :3], T_world_camera[:, :3, :3]
     moved_landmark = np.einsum("mij,mjs->mis", R_landmark, landmark_delta[:, 3:])
-    scale = np.sqrt(np.trace(noise.position_covariance, axis1=1, axis2=2))
+    scale = np.sqrt(np.trace(seen.covariance, axis1=1, axis2=2))
+    # A generous first gate on the sensor's scale plus a fifth of the range for the relative pose.
+    reach = 5 * scale + 0.2 * np.linalg.norm(seen.position, axis=1)
     out: list[tuple[np.ndarray, ...]] = []
-    for start in range(0, len(table), 2000):
-        part = np.arange(start, min(start + 2000, len(table)))
+    for start in range(0, len(seen), 2000):
+        part = np.arange(start, min(start + 2000, len(seen)))
         distance = np.linalg.norm(world[part, None] - position[None], axis=2)
-        # A generous first gate on the sensor's scale plus a fifth of the range for the relative pose.
-        reach = 5 * scale[part] + 0.2 * np.linalg.norm(table.position[part], axis=1)
-        i, j = np.nonzero(distance < reach[:, None])
+        i, j = np.nonzero(distance < reach[part, None])
         k = part[i]
-        frame = table.frame[k]
-        local = transform(inverse(estimate.T_world_camera[frame]), position[j])
-        error = local - table.position[k]
+        frame = seen.frame[k]
+        local = transform(inverse(T_world_camera[frame]), position[j])
+        error = local - seen.position[k]
         # Deviation of the landmark in the camera's frame: R'(dp - R v) - omega x local.
         deviation = np.einsum("pji,pjs->pis", R_camera[frame], moved_landmark[j]) - pose_delta[frame, 3:]
         deviation -= np.cross(pose_delta[frame, :3], local[:, :, None], axis=1)
-        S = noise.position_covariance[k] + deviation @ np.swapaxes(deviation, 1, 2) / count
+        S = seen.covariance[k] + deviation @ np.swapaxes(deviation, 1, 2) / count
         squared, log_determinant = squared_distance(error, S)
         inside = squared < GATE
         out.append((k[inside], j[inside], squared[inside], log_determinant[inside]))
@@ -117,50 +147,3 @@ def _gated(
         return empty, empty, np.zeros(0), np.zeros(0)
     rows, landmarks, square, log_det = (np.concatenate(x) for x in zip(*out))
     return rows, landmarks, square, log_det
-
-
-def _marginals(
-    frame: np.ndarray,
-    rows: np.ndarray,
-    landmarks: np.ndarray,
-    value: np.ndarray,
-    log_null: np.ndarray,
-    log_new: np.ndarray,
-    n: int,
-    m: int,
-    config: SlamConfig,
-) -> Associations:
-    order = np.argsort(frame, kind="stable")
-    frames, starts = np.unique(frame[order], return_index=True)
-    groups = np.split(order, starts[1:]) if len(frames) else []
-    by_row = np.argsort(rows, kind="stable")
-    sorted_rows = rows[by_row]
-    problems, columns_of = [], []
-    for group in groups:
-        spans = [by_row[np.searchsorted(sorted_rows, k, "left") : np.searchsorted(sorted_rows, k, "right")] for k in group]
-        entries = np.concatenate(spans)
-        columns, column = np.unique(landmarks[entries], return_inverse=True)
-        log_likelihood = np.full((len(group), len(columns)), -np.inf)
-        log_likelihood[np.repeat(np.arange(len(group)), [len(s) for s in spans]), column] = value[entries]
-        problems.append((log_likelihood, log_null[group]))
-        columns_of.append(columns)
-    marginals = association_marginals_batch(problems, associator=config.associator) if problems else []
-    out_row, out_landmark, out_weight = [], [], []
-    null = np.ones(n)
-    for group, columns, result in zip(groups, columns_of, marginals):
-        null[group] = result.null
-        i, j = np.nonzero(np.asarray(result.weights) > 1e-4)
-        out_row.append(group[i])
-        out_landmark.append(columns[j])
-        out_weight.append(np.asarray(result.weights)[i, j])
-    new = null * np.exp(log_new - log_null)
-    stack = (lambda x, t: np.concatenate(x).astype(t)) if out_row else (lambda x, t: np.zeros(0, t))
-    return Associations(
-        row=stack(out_row, np.int64),
-        landmark=stack(out_landmark, np.int64),
-        weight=stack(out_weight, np.float64),
-        new=new,
-        background=np.maximum(null - new, 0.0),
-        log_evidence=np.array([r.log_evidence for r in marginals]),
-        exact=all(r.exact for r in marginals),
-    )

@@ -17,7 +17,8 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.geometry.pose import make_pose, relative
-from nolbo_ppl.inference.slam.orientation import observed_modes, resolve_modes, resolved_symmetry
+from nolbo_ppl.inference.slam.measurements import Measurements
+from nolbo_ppl.inference.slam.orientation import resolve_modes
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
 LOOSE_ROTATION = 10.0
@@ -102,7 +103,8 @@ def widened(
 
 
 def resolve_observations(
-    problem: SlamProblem,
+    measurements: Measurements,
+    odometry: Float[np.ndarray, "n 4 4"],
     noise: NoiseModel,
     config: SlamConfig,
     estimate: SlamEstimate,
@@ -115,25 +117,23 @@ def resolve_observations(
     A mode with `SURE_MODE` stands alone. The share of the uninformative part keeps the position alone, as do detections
     without an orientation.
     """
-    table = problem.observations
-    frame = table.frame[rows]
+    seen = measurements.select(rows)
+    frame, symmetry = seen.frame, seen.symmetry
     predicted = relative(estimate.T_world_camera[frame], estimate.T_world_landmark[landmark])[:, :3, :3]
-    oriented = table.has_rotation[rows]
-    plain, o = np.flatnonzero(~oriented), np.flatnonzero(oriented)
-    symmetry = resolved_symmetry(table, config)[rows]
-    modes = resolve_modes(predicted[o], observed_modes(table, noise.rotation_scale, rows[o]), symmetry[o], config)
+    plain, o = np.flatnonzero(~seen.oriented), np.flatnonzero(seen.oriented)
+    modes = resolve_modes(predicted[o], seen.modes.select(o), symmetry[o], config)
     k = np.concatenate([plain, o[modes.row]])
     # Without an orientation the landmark's axes are the odometry's world axes: constant, so that the graph is too.
-    R = np.concatenate([np.swapaxes(problem.odometry[frame[plain], :3, :3], 1, 2), modes.R])
+    R = np.concatenate([np.swapaxes(odometry[frame[plain], :3, :3], 1, 2), modes.R])
     angular = np.concatenate([np.full(len(plain), np.inf), modes.scale]) * np.sqrt(noise.rotation_factor)
     informative = np.isfinite(angular)
     covariance = np.zeros((len(k), 6, 6))
     covariance[:, [0, 1, 2], [0, 1, 2]] = (np.where(informative, angular, LOOSE_ROTATION) ** 2)[:, None]
     covariance[informative & (symmetry[k] == 0), 2, 2] = LOOSE_ROTATION**2
-    S = widened(noise.position_covariance[rows[k]], table.position[rows[k]], noise.position_factor, noise.range_factor)
+    S = widened(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor)
     covariance[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ S @ R
     share = np.concatenate([np.ones(len(plain)), modes.responsibility])
-    return ObservationFactors(frame[k], landmark[k], make_pose(R, table.position[rows[k]]), covariance, weight[k] * share)
+    return ObservationFactors(frame[k], landmark[k], make_pose(R, seen.position[k]), covariance, weight[k] * share)
 
 
 def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.NonlinearFactorGraph:

@@ -11,6 +11,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.graph import Links, optimise
 from nolbo_ppl.inference.slam.initialise import SlamState, base_graph, first_estimate, tracklet_features
+from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.tracking import Tracklets
@@ -31,12 +32,13 @@ def solve_with_associations(
     if len(object_of) != len(problem.observations):
         raise input_error("associations do not match", got=len(object_of), expected=len(problem.observations))
     noise = noise or estimate_noise(problem, config)
-    prior = fit_prior(problem.observations, config)
+    prior = fit_prior(problem.observations, config, noise)
+    measurements = resolve(problem.observations, noise, config, prior)
     rows = np.flatnonzero(object_of >= 0)
     landmark = np.unique(object_of[rows], return_inverse=True)[1].astype(np.int64)
     count = int(landmark.max(initial=-1)) + 1
     weight = np.ones(len(rows))
-    features = tracklet_features(problem, noise, config, prior, rows, landmark, weight, count)
+    features = tracklet_features(measurements, config, prior, rows, landmark, weight, count)
     full = np.full(len(object_of), -1)
     full[rows] = landmark
     tracklets = Tracklets(
@@ -58,7 +60,7 @@ def solve_with_associations(
         landmark=landmark,
         weight=weight,
         features=features,
-        estimate=first_estimate(problem, noise, config, rows, landmark, count),
+        estimate=first_estimate(measurements, problem.odometry, config, rows, landmark, count),
         links=Links.none(),
         typical_range=float(np.median(np.linalg.norm(problem.observations.position, axis=1))) if len(full) else 1.0,
     )

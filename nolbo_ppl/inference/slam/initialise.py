@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, make_pose, transform
 from nolbo_ppl.inference.slam.detection_features import (
+    LARGE_VARIANCE,
     FeaturePrior,
     correlated_variance,
-    detection_features,
     fit_prior,
     weighted_latents,
 )
@@ -30,10 +30,11 @@ from nolbo_ppl.inference.slam.graph import (
     resolve_observations,
 )
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
+from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, stated_scales
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
-from nolbo_ppl.inference.slam.orientation import mixture_log_density, observed_modes, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_state import SlamState
 from nolbo_ppl.inference.slam.tracking import Tracklets, build_tracklets
@@ -43,25 +44,25 @@ RETRACK = 2.5
 
 
 def first_estimate(
-    problem: SlamProblem,
-    noise: NoiseModel,
+    measurements: Measurements,
+    T_world_camera: Float[np.ndarray, "n 4 4"],
     config: SlamConfig,
     rows: Int[np.ndarray, " k"],
     landmark: Int[np.ndarray, " k"],
     landmarks: int,
 ) -> SlamEstimate:
-    """Landmarks at the weighted mean of their detections in the odometry frame, oriented as most of them agree."""
-    table = problem.observations
-    frame = table.frame[rows]
-    world = transform(problem.odometry[frame], table.position[rows])
-    w = 1.0 / np.maximum(np.trace(noise.position_covariance[rows], axis1=1, axis2=2), 1e-12)
+    """Landmarks at the weighted mean of their detections under the given poses, oriented as most of them agree."""
+    seen = measurements.select(rows)
+    seen = seen.in_world(T_world_camera[seen.frame])
+    world = seen.position
+    w = 1.0 / np.maximum(np.trace(seen.covariance, axis1=1, axis2=2), 1e-12)
     total = np.bincount(landmark, weights=w, minlength=landmarks)
     mean = np.stack([np.bincount(landmark, weights=w * world[:, i], minlength=landmarks) for i in range(3)], axis=1)
     T = make_pose(np.tile(np.eye(3), (landmarks, 1, 1)), mean / np.maximum(total, 1e-300)[:, None])
-    symmetry = resolved_symmetry(table, config)[rows]
-    oriented = np.flatnonzero(table.has_rotation[rows])
-    modes = observed_modes(table, np.maximum(noise.rotation_scale, 0.05), rows[oriented])
-    modes = modes.turned(problem.odometry[frame[oriented], :3, :3])
+    symmetry = seen.symmetry
+    oriented = np.flatnonzero(seen.oriented)
+    modes = seen.modes.select(oriented)
+    modes = OrientationModes(modes.log_weight, modes.R, np.maximum(modes.scale, 0.05))
     order = np.argsort(landmark[oriented], kind="stable")
     groups, starts = np.unique(landmark[oriented][order], return_index=True)
     for j, members in zip(groups, np.split(order, starts[1:])):
@@ -71,13 +72,20 @@ def first_estimate(
         a, b = np.repeat(np.arange(len(candidates)), len(members)), np.tile(members, len(candidates))
         value = mixture_log_density(candidates[a], modes.select(b), symmetry[oriented[b]], config)
         T[j, :3, :3] = candidates[np.argmax(value.reshape(len(candidates), -1).sum(axis=1))]
-    return SlamEstimate(problem.odometry.copy(), T)
+    return SlamEstimate(T_world_camera.copy(), T)
 
 
 def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     """Odometry, weighted observations and weak priors; the M-step adds its links."""
     factors = resolve_observations(
-        state.problem, state.noise, state.config, state.estimate, state.rows, state.landmark, state.weight
+        state.measurements,
+        state.problem.odometry,
+        state.noise,
+        state.config,
+        state.estimate,
+        state.rows,
+        state.landmark,
+        state.weight,
     )
     graph = odometry_factors(state.problem, state.noise)
     add_observation_factors(graph, factors)
@@ -91,20 +99,16 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     Odds are objectness times the density of the position about the prediction, against the clutter density. This is how
     gross errors leave the graph: by evidence, with weights frozen through the next M-step.
     """
-    table, rows = state.problem.observations, state.rows
-    frame = table.frame[rows]
-    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
-    error = predicted - table.position[rows]
-    S = state.noise.position_covariance[rows]
-    objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
-    log_object = np.log(objectness) + log_normal(error, S)
-    log_background = np.log1p(-objectness) + np.log(state.noise.clutter_rate)
+    seen = state.measurements.select(state.rows)
+    T_camera_world = inverse(state.estimate.T_world_camera[seen.frame])
+    error = transform(T_camera_world, state.estimate.T_world_landmark[state.landmark, :3, 3]) - seen.position
+    log_object = seen.log_object + log_normal(error, seen.covariance)
+    log_background = seen.log_clutter + np.log(state.noise.clutter_rate)
     return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
 
 
 def tracklet_features(
-    problem: SlamProblem,
-    noise: NoiseModel,
+    measurements: Measurements,
     config: SlamConfig,
     prior: FeaturePrior,
     rows: Int[np.ndarray, " k"],
@@ -113,22 +117,23 @@ def tracklet_features(
     landmarks: int,
 ) -> TrackletFeatures:
     """Latent posterior, category, symmetry and life span of each landmark from its detections."""
-    table = problem.observations
-    latent, variance, category = detection_features(table, noise, prior)
-    mean, spread = weighted_latents(latent[rows], variance[rows], landmark, weight, landmarks)
-    views = np.bincount(landmark, weights=weight * table.has_latent[rows], minlength=landmarks)
+    seen = measurements.select(rows)
+    category = seen.category
+    mean, spread = weighted_latents(seen.latent, seen.latent_variance, landmark, weight, landmarks)
+    known = (seen.latent_variance < LARGE_VARIANCE).all(axis=1) if mean.shape[1] else np.zeros(len(rows), bool)
+    views = np.bincount(landmark, weights=weight * known, minlength=landmarks)
     spread = correlated_variance(spread, views, config.latent_correlation or 0.0)
     votes = np.zeros((landmarks, len(prior.categories) + 1))
-    named = category[rows] >= 0
-    np.add.at(votes, (landmark[named], category[rows][named]), weight[named])
+    named = category >= 0
+    np.add.at(votes, (landmark[named], category[named]), weight[named])
     best = np.where(votes.sum(axis=1) > 0, np.argmax(votes, axis=1), -1)
     symmetry = np.ones(landmarks, dtype=np.int64)
-    symmetry[landmark] = resolved_symmetry(table, config)[rows]
+    symmetry[landmark] = seen.symmetry
     oriented = np.zeros(landmarks, dtype=bool)
-    oriented[landmark[table.has_rotation[rows]]] = True
-    first, last = np.full(landmarks, len(problem)), np.full(landmarks, -1)
-    np.minimum.at(first, landmark, table.frame[rows])
-    np.maximum.at(last, landmark, table.frame[rows])
+    oriented[landmark[seen.oriented]] = True
+    first, last = np.full(landmarks, measurements.frame.max(initial=-1) + 1), np.full(landmarks, -1)
+    np.minimum.at(first, landmark, seen.frame)
+    np.maximum.at(last, landmark, seen.frame)
     return TrackletFeatures(mean, spread, log_population(mean, spread), best, symmetry, oriented, first, last)
 
 
@@ -148,7 +153,7 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
         GraphError: GTSAM could not solve the graph.
     """
     noise = estimate_noise(problem, config)
-    prior = fit_prior(problem.observations, config)
+    prior = fit_prior(problem.observations, config, noise)
     tracklets = build_tracklets(problem, noise, config, prior)
     state = init_from_tracklets(problem, config, noise, prior, tracklets)
     if all(stated_scales(problem, config)) or not len(tracklets):
@@ -175,6 +180,7 @@ def init_from_tracklets(
     rows = np.flatnonzero(landmark >= 0)
     landmark, weight = landmark[rows], tracklets.weight[rows]
     distance = np.linalg.norm(problem.observations.position, axis=1)
+    measurements = resolve(problem.observations, noise, config, prior)
     state = SlamState(
         problem=problem,
         config=config,
@@ -185,8 +191,8 @@ def init_from_tracklets(
         rows=rows,
         landmark=landmark,
         weight=weight,
-        features=tracklet_features(problem, noise, config, prior, rows, landmark, weight, len(static)),
-        estimate=first_estimate(problem, noise, config, rows, landmark, len(static)),
+        features=tracklet_features(measurements, config, prior, rows, landmark, weight, len(static)),
+        estimate=first_estimate(measurements, problem.odometry, config, rows, landmark, len(static)),
         links=Links.none(),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
     )

@@ -43,9 +43,9 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
     """The same problem with landmarks joined: numbering, features, first positions from the current poses."""
     count = int(cluster.max(initial=-1)) + 1
     landmark = cluster[state.landmark]
-    moved = replace(state.problem, odometry=state.estimate.T_world_camera)
-    estimate = first_estimate(moved, state.noise, state.config, state.rows, landmark, count)
-    features = tracklet_features(state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count)
+    T_world_camera = state.estimate.T_world_camera
+    estimate = first_estimate(state.measurements, T_world_camera, state.config, state.rows, landmark, count)
+    features = tracklet_features(state.measurements, state.config, state.prior, state.rows, landmark, state.weight, count)
     return replace(
         state,
         landmark=landmark,
@@ -53,7 +53,7 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
         features=features,
         links=Links.none(),
         closed={},
-        estimate=SlamEstimate(state.estimate.T_world_camera, estimate.T_world_landmark),
+        estimate=estimate,
     )
 
 
@@ -90,7 +90,7 @@ def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, 
     """E-step of every detection against the map; detections join or leave landmarks by it, empty landmarks go."""
     graph = base_graph(state)
     found = associate_detections(
-        state.problem,
+        state.measurements,
         state.noise,
         state.config,
         state.prior,
@@ -127,7 +127,7 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
         static=np.arange(count),
         estimate=SlamEstimate(state.estimate.T_world_camera, state.estimate.T_world_landmark[keep]),
     )
-    features = tracklet_features(state.problem, state.noise, state.config, state.prior, state.rows, landmark, state.weight, count)
+    features = tracklet_features(state.measurements, state.config, state.prior, state.rows, landmark, state.weight, count)
     return replace(state, features=features)
 
 

@@ -16,39 +16,50 @@ import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import make_pose, relative, se3_log
-from nolbo_ppl.inference.association import association_marginals_batch
-from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, detection_features, fit_prior, latent_log_density
+from nolbo_ppl.geometry.pose import inverse, make_pose, relative, skew, so3_log, transform
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, fit_prior, latent_log_density
+from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
+from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import (
-    LOOSE_ROTATION,
     ObservationFactors,
     SlamEstimate,
     add_landmark_priors,
     add_observation_factors,
+    landmark_key,
     odometry_factors,
     optimise,
+    pose_key,
     to_values,
 )
+from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
-from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry, turn_shares, vertical_turns
+from nolbo_ppl.inference.slam.orientation import (
+    UNIFORM_LOG_DENSITY,
+    angle_log_normaliser,
+    nearest_mode_rotation,
+    turn_shares,
+    vertical_turns,
+)
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
-SMALLEST_WEIGHT = 1e-12
+SMALLEST_WEIGHT = 1e-10
 """Weights below this are left out of the M-step."""
+NO_INFORMATION = 1e5
+"""Standard deviation, rad or m, of the part of a factor that says nothing."""
 
 
 @dataclass(frozen=True)
 class Modes:
-    """Every detection split into the modes of its orientation: a weighted list of measured poses."""
+    """Every detection split into the modes of its orientation: a weighted list of measured rotations."""
 
     row: Int[np.ndarray, " g"]
     """Detection of each mode."""
     log_weight: Float[np.ndarray, " g"]
-    """Log prior weight of the mode."""
-    T_camera_landmark: Float[np.ndarray, "g 4 4"]
-    """Measured pose."""
-    covariance: Float[np.ndarray, "g 6 6"]
-    """[rotation, position] in the measured landmark's frame."""
+    """Log prior weight of the mode over its normaliser, relative to the uniform density on SO(3)."""
+    R_camera_landmark: Float[np.ndarray, "g 3 3"]
+    """Measured rotation."""
+    angle: Float[np.ndarray, "g 3"]
+    """Standard deviation of each angle, rad; infinite where it is free."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,10 @@ class PlainState:
     """Settings."""
     noise: NoiseModel
     """Scales in use."""
+    prior: FeaturePrior
+    """Population of latents."""
+    measurements: Measurements
+    """Detections, resolved."""
     modes: Modes
     """Detections by mode."""
     estimate: SlamEstimate
@@ -89,43 +104,41 @@ class PlainInfo:
     """Sum of the weights of each landmark."""
 
 
-def split_modes(problem: SlamProblem, noise: NoiseModel, config: SlamConfig) -> Modes:
-    """All orientation modes of all detections: those stated, symmetry, half turn, and one that says nothing."""
-    table = problem.observations
-    symmetry = resolved_symmetry(table, config)
-    stated = observed_modes(table, noise.rotation_scale)
-    rows, weights, rotations, scales = [], [], [], []
-    for k in range(len(table)):
-        if not table.has_rotation[k]:
-            rows.append(k)
-            weights.append(0.0)
-            rotations.append(problem.odometry[table.frame[k], :3, :3].T)
-            scales.append(np.full(3, LOOSE_ROTATION))
-            continue
-        order = int(symmetry[k])
-        turns = vertical_turns(order) if order else np.eye(3)[None]
-        shares = turn_shares(order, len(turns), config) if order else np.ones(1)
-        for log_weight, R_mode, angle in zip(stated.log_weight[k], stated.R[k], stated.scale[k]):
-            if not np.isfinite(log_weight):
-                continue
-            for share, turn in zip(shares, turns):
-                scale = np.full(3, angle)
-                if order == 0:
-                    scale[2] = LOOSE_ROTATION
-                rows.append(k)
-                weights.append(np.log1p(-config.orientation_outlier) + log_weight + np.log(max(share, 1e-300)))
-                rotations.append(R_mode @ turn)
-                scales.append(scale)
-        rows.append(k)
-        weights.append(np.log(config.orientation_outlier))
-        rotations.append(table.rotation[k])
-        scales.append(np.full(3, LOOSE_ROTATION))
-    row = np.array(rows, dtype=np.int64)
-    R = np.array(rotations).reshape(-1, 3, 3)
-    covariance = np.zeros((len(row), 6, 6))
-    covariance[:, [0, 1, 2], [0, 1, 2]] = np.array(scales).reshape(-1, 3) ** 2
-    covariance[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ noise.position_covariance[row] @ R
-    return Modes(row, np.array(weights), make_pose(R, table.position[row].reshape(-1, 3)), covariance)
+def split_modes(problem: SlamProblem, measurements: Measurements, config: SlamConfig) -> Modes:
+    """All orientation modes of all detections: those stated, symmetry, half turn, and one that says nothing.
+
+    Every mode is a density over position and SO(3), in m^-3 and relative to the uniform density: a detection without an
+    orientation, and the part of one that says nothing, are a density of the position alone times one.
+    """
+    seen = measurements
+    R_plain = np.swapaxes(problem.odometry[seen.frame, :3, :3], 1, 2)
+    row, log_weight, rotation, scale = [], [], [], []
+    oriented = np.flatnonzero(seen.oriented)
+    for order in np.unique(seen.symmetry[oriented]):
+        k = oriented[seen.symmetry[oriented] == order]
+        turns = vertical_turns(int(order)) if order else np.eye(3)[None]
+        with np.errstate(divide="ignore"):
+            shares = np.log(turn_shares(int(order), len(turns), config) if order else np.ones(1))
+        stated = seen.modes.select(k)
+        angle = np.broadcast_to(stated.scale[:, :, None], (*stated.scale.shape, len(turns)))
+        normaliser = angle_log_normaliser(angle, 3) if order else angle_log_normaliser(angle, 2) + np.log(2 * np.pi)
+        value = np.log1p(-config.orientation_outlier) + stated.log_weight[:, :, None] + shares - normaliser
+        turned = stated.R[:, :, None] @ turns
+        third = angle if order else np.full(angle.shape, np.inf)
+        i = np.broadcast_to(k[:, None, None], value.shape)
+        use = np.isfinite(value)
+        row.append(i[use])
+        log_weight.append(value[use] - UNIFORM_LOG_DENSITY)
+        rotation.append(turned[use])
+        scale.append(np.stack([angle, angle, third], axis=-1)[use])
+    for k, weight in ((oriented, config.orientation_outlier), (np.flatnonzero(~seen.oriented), 1.0)):
+        if weight > 0:
+            row.append(k)
+            log_weight.append(np.full(len(k), np.log(weight)))
+            rotation.append(R_plain[k])
+            scale.append(np.full((len(k), 3), np.inf))
+    index, R, angles = np.concatenate(row).astype(np.int64), np.concatenate(rotation), np.concatenate(scale)
+    return Modes(index, np.concatenate(log_weight), R, angles)
 
 
 def plain_init(
@@ -143,100 +156,131 @@ def plain_init(
     noise = noise or estimate_noise(problem, config)
     table = problem.observations
     m = len(T_world_landmark)
-    mean = fit_prior(table, config).mean
+    prior = fit_prior(table, config, noise)
+    measurements = resolve(table, noise, config, prior)
     distance = np.linalg.norm(table.position, axis=1)
     return PlainState(
         problem=problem,
         config=config,
         noise=noise,
-        modes=split_modes(problem, noise, config),
+        prior=prior,
+        measurements=measurements,
+        modes=split_modes(problem, measurements, config),
         estimate=SlamEstimate(problem.odometry.copy(), np.asarray(T_world_landmark, dtype=np.float64)),
         prior_pose=np.asarray(T_world_landmark, dtype=np.float64),
-        latent=np.tile(mean, (m, 1)) if latent is None else np.asarray(latent, dtype=np.float64),
+        latent=np.tile(prior.mean, (m, 1)) if latent is None else np.asarray(latent, dtype=np.float64),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
     )
 
 
-def mode_log_likelihood(state: PlainState) -> Float[np.ndarray, "g m"]:
-    """Log density of every mode of every detection under every landmark, weight of the mode included."""
-    modes, m = state.modes, len(state.estimate.T_world_landmark)
-    frame = state.problem.observations.frame[modes.row]
-    whitening = np.linalg.inv(np.linalg.cholesky(modes.covariance))
-    log_normaliser = np.sum(np.log(np.diagonal(whitening, axis1=1, axis2=2)), axis=1) - 3 * np.log(2 * np.pi)
-    out = np.empty((len(modes.row), m))
-    for j, T_world_landmark in enumerate(state.estimate.T_world_landmark):
-        predicted = relative(state.estimate.T_world_camera[frame], T_world_landmark[None])
-        error = se3_log(relative(modes.T_camera_landmark, predicted))  # as GTSAM's BetweenFactorPose3
-        white = np.einsum("gij,gj->gi", whitening, error)
-        out[:, j] = modes.log_weight - 0.5 * np.sum(white**2, axis=1) + log_normaliser
+def position_log_density(state: PlainState) -> Float[np.ndarray, "k m"]:
+    """Log density of every observed position under every landmark, m^-3."""
+    seen = state.measurements
+    landmarks = state.estimate.T_world_landmark[:, :3, 3]
+    local = transform(inverse(state.estimate.T_world_camera[seen.frame])[:, None], landmarks[None])
+    return log_normal(local - seen.position[:, None], seen.covariance[:, None])
+
+
+def mode_log_density(state: PlainState) -> Float[np.ndarray, "g m"]:
+    """Log density of every mode of every orientation under every landmark over the uniform density, weight included."""
+    modes, estimate = state.modes, state.estimate
+    frame = state.measurements.frame[modes.row]
+    out = np.tile(modes.log_weight[:, None], (1, len(estimate.T_world_landmark)))
+    informed, free = np.isfinite(modes.angle[:, 0]), np.isinf(modes.angle[:, 2])
+    for rows in (np.flatnonzero(informed & ~free), np.flatnonzero(informed & free)):
+        R_world_camera = estimate.T_world_camera[frame[rows], :3, :3]
+        predicted = np.swapaxes(R_world_camera, 1, 2)[:, None] @ estimate.T_world_landmark[None, :, :3, :3]
+        measured = modes.R_camera_landmark[rows, None]
+        if len(rows) and free[rows[0]]:
+            # A free axis leaves the tilt: the angle between the two vertical axes.
+            up = measured[..., 2] - predicted[..., 2]
+            angle = 2 * np.arcsin(np.clip(0.5 * np.linalg.norm(up, axis=-1), 0, 1))
+        else:
+            angle = np.linalg.norm(so3_log(np.swapaxes(measured, -1, -2) @ predicted), axis=-1)
+        out[rows] -= 0.5 * (angle / modes.angle[rows, :1]) ** 2
     return out
 
 
 def e_step(state: PlainState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarray, "k m"], float]:
-    """Weights of every mode and of every detection for every landmark, and the log evidence of all frames."""
-    table, config, noise = state.problem.observations, state.config, state.noise
-    n, m = len(table), len(state.estimate.T_world_landmark)
-    by_mode = mode_log_likelihood(state)
+    """Weights of every mode and of every detection for every landmark, and the log evidence of all frames.
+
+    Orientation and latent enter as ratios to the uniform density on SO(3) and to the population, so that every hypothesis is
+    a density over position alone; what is common to all of them is left out of the evidence.
+    """
+    seen, config, noise = state.measurements, state.config, state.noise
+    n, m = len(seen), len(state.estimate.T_world_landmark)
+    by_mode = mode_log_density(state)
     log_likelihood = np.full((n, m), -np.inf)
     np.logaddexp.at(log_likelihood, state.modes.row, by_mode)
     share = np.exp(by_mode - log_likelihood[state.modes.row])
-    latent, variance, _ = detection_features(table, noise, fit_prior(table, config))
-    if table.latent_dim:
-        known = variance[:, 0] < LARGE_VARIANCE
-        log_likelihood[known] += latent_log_density(latent[known][:, None], state.latent[None], variance[known][:, None])
-    objectness = np.clip(table.objectness, *config.objectness_limits)
-    log_new = np.log(objectness) + np.log(noise.new_rate)
-    if table.latent_dim:
-        # A new object's latent comes from the population; background shows the same, so that the terms compare.
-        population = np.zeros(n)
-        if known.any():
-            mean, spread = latent[known].mean(axis=0), latent[known].var(axis=0)
-            population[known] = latent_log_density(latent[known], mean, variance[known] + spread)
-    else:
-        population = np.zeros(n)
-    log_null = np.logaddexp(log_new, np.log1p(-objectness) + np.log(noise.clutter_rate)) + population
-    log_likelihood += np.log(objectness)[:, None]
-    order = np.argsort(table.frame, kind="stable")
-    frames, starts = np.unique(table.frame[order], return_index=True)
-    groups = np.split(order, starts[1:]) if len(frames) else []
-    results = (
-        association_marginals_batch([(log_likelihood[g], log_null[g]) for g in groups], associator=config.associator)
-        if groups
-        else []
-    )
+    log_likelihood += position_log_density(state) + seen.log_object[:, None]
+    if seen.latent.shape[1]:
+        known = seen.latent_variance[:, 0] < LARGE_VARIANCE
+        latent, variance = seen.latent[known], seen.latent_variance[known]
+        population = latent_log_density(latent, state.prior.mean, variance + state.prior.variance)
+        log_likelihood[known] += latent_log_density(latent[:, None], state.latent[None], variance[:, None]) - population[:, None]
+    log_null = np.logaddexp(seen.log_object + np.log(noise.new_rate), seen.log_clutter + np.log(noise.clutter_rate))
+    k, j = np.nonzero(np.isfinite(log_likelihood))
+    found = frame_marginals(seen.frame, k, j, log_likelihood[k, j], log_null, associator=config.associator)
     weights = np.zeros((n, m))
-    for group, result in zip(groups, results):
-        weights[group] = result.weights
-    return weights[state.modes.row] * share, weights, float(sum(r.log_evidence for r in results))
+    weights[k, j] = found.weight
+    return weights[state.modes.row] * share, weights, float(found.log_evidence.sum())
 
 
-def frozen_graph(state: PlainState, mode_weights: Float[np.ndarray, "g m"] | None) -> gtsam.NonlinearFactorGraph:
-    """Odometry and priors, and observations at frozen weights when given."""
+def position_factor(
+    pose: int, landmark: int, position: Float[np.ndarray, " 3"], covariance: Float[np.ndarray, "3 3"]
+) -> gtsam.CustomFactor:
+    """An observed position alone: `R'(l - t) - x`. A between-factor's translation is turned by its rotation's error."""
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        keys = factor.keys()
+        T_world_camera, T_world_landmark = (values.atPose3(key).matrix() for key in (keys[0], keys[1]))
+        R = T_world_camera[:3, :3].T
+        local = R @ (T_world_landmark[:3, 3] - T_world_camera[:3, 3])
+        if jacobians is not None:
+            jacobians[0] = np.concatenate([skew(local), -np.eye(3)], axis=1)
+            jacobians[1] = np.concatenate([np.zeros((3, 3)), R @ T_world_landmark[:3, :3]], axis=1)
+        return local - position
+
+    model = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    return gtsam.CustomFactor(model, [pose_key(pose), landmark_key(landmark)], error)
+
+
+def frozen_graph(
+    state: PlainState, weights: Float[np.ndarray, "k m"] | None, mode_weights: Float[np.ndarray, "g m"] | None
+) -> gtsam.NonlinearFactorGraph:
+    """Odometry and priors, and observations at frozen weights when given: a position a pair, a rotation a mode."""
     graph = odometry_factors(state.problem, state.noise)
     add_landmark_priors(graph, state.prior_pose, state.typical_range)
-    if mode_weights is not None:
-        g, j = np.nonzero(mode_weights > SMALLEST_WEIGHT)
-        factors = ObservationFactors(
-            state.problem.observations.frame[state.modes.row[g]],
-            j,
-            state.modes.T_camera_landmark[g],
-            state.modes.covariance[g],
-            mode_weights[g, j],
-        )
-        add_observation_factors(graph, factors, minimum=SMALLEST_WEIGHT)
+    if weights is None or mode_weights is None:
+        return graph
+    seen, modes, estimate = state.measurements, state.modes, state.estimate
+    for k, j in zip(*np.nonzero(weights > SMALLEST_WEIGHT)):
+        graph.add(position_factor(seen.frame[k], j, seen.position[k], seen.covariance[k] / weights[k, j]))
+    g, j = np.nonzero((mode_weights > SMALLEST_WEIGHT) & np.isfinite(modes.angle[:, :1]))
+    frame, measured = seen.frame[modes.row[g]], modes.R_camera_landmark[g]
+    predicted = relative(estimate.T_world_camera[frame], estimate.T_world_landmark[j])[:, :3, :3]
+    free = np.isinf(modes.angle[g, 2])
+    # Turned about its free axis to the prediction, the two other angles bound the tilt from above and touch it here.
+    no_symmetry = np.zeros(int(free.sum()), dtype=np.int64)
+    measured[free] = nearest_mode_rotation(predicted[free], measured[free], no_symmetry)
+    covariance = np.zeros((len(g), 6, 6))
+    covariance[:, [0, 1, 2], [0, 1, 2]] = np.minimum(modes.angle[g], NO_INFORMATION) ** 2
+    covariance[:, [3, 4, 5], [3, 4, 5]] = NO_INFORMATION**2
+    factors = ObservationFactors(frame, j, make_pose(measured, np.zeros(3)), covariance, mode_weights[g, j])
+    add_observation_factors(graph, factors, minimum=SMALLEST_WEIGHT)
     return graph
 
 
 def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
     """One E-step and one M-step; the bound is that of the state it was given."""
     mode_weights, weights, evidence = e_step(state)
-    prior_error = frozen_graph(state, None).error(to_values(state.estimate))
+    prior_error = frozen_graph(state, None, None).error(to_values(state.estimate))
     info = PlainInfo(state.iteration + 1, evidence - prior_error, evidence, weights.sum(axis=0))
-    estimate, _, _ = optimise(frozen_graph(state, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10)
+    estimate, _, _ = optimise(frozen_graph(state, weights, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10)
     latent = state.latent
-    table = state.problem.observations
-    if table.latent_dim:
-        value, variance, _ = detection_features(table, state.noise, fit_prior(table, state.config))
+    value, variance = state.measurements.latent, state.measurements.latent_variance
+    if value.shape[1]:
         known = variance[:, 0] < LARGE_VARIANCE
         precision = np.einsum("km,kd->md", weights[known], 1.0 / variance[known])
         total = np.einsum("km,kd->md", weights[known], value[known] / variance[known])

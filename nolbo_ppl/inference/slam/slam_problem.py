@@ -42,6 +42,9 @@ class SlamConfig:
     """Density of false detections, per m^3 of the observed space and frame."""
     objectness_limits: tuple[float, float] = (0.02, 0.98)
     """Objectness is clipped to this, so that background always remains possible."""
+    objectness_prior: float | None = None
+    """Share of true detections among those that objectness was calibrated on: objectness is a posterior, its odds over the
+    odds of this share are the likelihood ratio of the score. None: the mean objectness of these detections."""
     correct_scales: bool = True
     """Raise stated scales that the data show to be too small (always reported)."""
     flip_probability: float = 0.03
@@ -86,6 +89,8 @@ class SlamConfig:
     def __post_init__(self) -> None:
         if self.latent_correlation is not None and not 0 <= self.latent_correlation < 1:
             raise input_error("latent_correlation", got=self.latent_correlation, expected="a correlation from 0 to below 1")
+        if self.objectness_prior is not None and not 0 < self.objectness_prior < 1:
+            raise input_error("objectness_prior", got=self.objectness_prior, expected="a share between 0 and 1")
 
 
 def check_step_covariance(covariance: np.ndarray, steps: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -14,7 +15,7 @@ from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, category_index
 from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.gaussian import log_normal
-from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise
+from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise, to_values
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, Voxels, decode_landmarks
 from nolbo_ppl.inference.slam.map_refinement import final_graph
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -42,9 +43,23 @@ class SlamResult:
         return self.state.estimate.T_world_camera
 
     @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The final factor graph as GTSAM's own: keys `gtsam.symbol("x", row)` for poses, `gtsam.symbol("l", j)` for landmarks.
+
+        Example: add a factor of your own and solve again with
+        `gtsam.LevenbergMarquardtOptimizer(graph, result.values).optimize()`.
+        """
+        return final_graph(self.state)
+
+    @property
+    def values(self) -> gtsam.Values:
+        """The answer as GTSAM's values, under the keys of `graph`."""
+        return to_values(self.state.estimate)
+
+    @cached_property
     def linearisation(self) -> Linearisation:
         """The final graph linearised at the answer."""
-        return linearise(final_graph(self.state), self.state.estimate)
+        return linearise(self.graph, self.state.estimate)
 
     def pose_covariances(self, rows: Int[np.ndarray, " r"] | None = None) -> Float[np.ndarray, "r 6 6"]:
         """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed."""

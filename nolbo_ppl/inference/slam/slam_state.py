@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +11,7 @@ from jaxtyping import Float, Int
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
 from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
+from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.tracking import Tracklets
 
@@ -52,6 +54,11 @@ class SlamState:
     """Half the sum of squared whitened residuals of the last M-step."""
     closed: dict[int, int] = field(default_factory=dict)
     """Tracklets closed by constellation, newer to older."""
+
+    @cached_property
+    def measurements(self) -> Measurements:
+        """The detections, everything resolved under the noise in use."""
+        return resolve(self.problem.observations, self.noise, self.config, self.prior)
 
     @property
     def link_scale(self) -> float:

@@ -58,7 +58,9 @@ def solve(
 
 def complete(state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None) -> SlamResult:
     """Iterate a state, finish it, and keep what every iteration held."""
-    start = first_estimate(state.problem, state.noise, state.config, state.rows, state.landmark, len(state.static))
+    start = first_estimate(
+        state.measurements, state.problem.odometry, state.config, state.rows, state.landmark, len(state.static)
+    )
     history = [start]
 
     def record(state: SlamState, info: EmStepInfo) -> None:

@@ -13,20 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.geometry.pose import transform
-from nolbo_ppl.inference.association import association_marginals
-from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_features, fuse_latent
+from nolbo_ppl.inference.slam.detection_features import FeaturePrior, fuse_latent
+from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.orientation import (
-    UNIFORM_LOG_DENSITY,
-    OrientationModes,
-    mixture_log_density,
-    observed_modes,
-    resolved_symmetry,
-)
+from nolbo_ppl.inference.slam.measurements import Measurements, resolve
+from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
 GATE = 30.0
 """Squared Mahalanobis distance beyond which a detection cannot belong to a track (3 degrees of freedom: p = 1e-6)."""
+LEAST_NEW = -5.0
+"""Log odds of a new object against clutter below which a detection founds no track."""
 
 
 @dataclass(frozen=True)
@@ -83,80 +80,68 @@ class Tracker:
             setattr(self, name, getattr(self, name)[rows])
         self.modes = self.modes.select(rows)
 
-    def associate(
-        self,
-        position: Float[np.ndarray, "n 3"],
-        covariance: Float[np.ndarray, "n 3 3"],
-        modes: OrientationModes,
-        oriented: Bool[np.ndarray, " n"],
-        symmetry: Int[np.ndarray, " n"],
-        latent: Float[np.ndarray, "n d"],
-        latent_variance: Float[np.ndarray, "n d"],
-        category: Int[np.ndarray, " n"],
-        objectness: Float[np.ndarray, " n"],
-        frame: int,
-    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Assign detections (in the world frame) to tracks and found new ones; track and marginal of each, -1: background."""
-        count = max(modes.log_weight.shape[1], self.modes.log_weight.shape[1])
-        modes, self.modes = modes.padded(count), self.modes.padded(count)
-        n, m = len(position), len(self.index)
-        log_likelihood = np.full((n, m), -np.inf)
-        log_object, log_background = np.log(objectness), np.log1p(-objectness) + np.log(self.clutter_rate)
-        log_null = np.logaddexp(log_object + np.log(self.new_rate), log_background)
-        if m:
-            gap = position[:, None] - self.mean[None]
-            S = covariance[:, None] + self.covariance[None]
-            near = np.sum(gap**2, axis=2) <= GATE * np.trace(S, axis1=2, axis2=3)
-            k, j = np.nonzero(near)
-            S, gap = S[k, j], gap[k, j]
-            square, log_det = squared_distance(gap, S)
-            inside = square < GATE
-            k, j = k[inside], j[inside]
-            value = log_object[k] - 0.5 * (square + log_det)[inside]
-            both = np.flatnonzero(oriented[k] & self.oriented[j])
-            if len(both):
-                value[both] += self._orientation(j[both], modes.select(k[both]), symmetry[k[both]])
-            value += self.prior.pair_log_ratio(
-                latent[k], latent_variance[k], category[k], self.latent[j], self.latent_variance[j], self.category[j]
-            )
-            log_likelihood[k, j] = value
-        if np.isfinite(log_likelihood).any():
-            marginals = association_marginals(log_likelihood, log_null, associator=self.config.associator)
-            weights, null = np.asarray(marginals.weights), np.asarray(marginals.null)
-        else:
-            weights, null = np.zeros((n, m)), np.ones(n)
-        assigned, weight = np.full(n, -1, dtype=np.int64), null.copy()
-        best = np.argmax(weights, axis=1) if m else np.zeros(n, dtype=np.int64)
-        found = []
-        for i in range(n):
-            if m and weights[i, best[i]] > 0.5:
-                track = int(best[i])
-                self._update(track, position[i], covariance[i], latent[i], latent_variance[i], frame)
-                if oriented[i]:
-                    self._orient(track, modes.select(np.array([i])), symmetry[[i]])
-                assigned[i], weight[i] = self.index[track], weights[i, track]
-            elif null[i] > 0.5 and objectness[i] > 0.05:
-                found.append(i)
-        if found:
-            rows = np.array(found, dtype=np.int64)
-            new = np.arange(self.total, self.total + len(rows))
-            self.total += len(rows)
-            assigned[rows] = new
-            self.index = np.concatenate([self.index, new])
-            self.mean = np.concatenate([self.mean, position[rows]])
-            self.covariance = np.concatenate([self.covariance, covariance[rows]])
-            self.last = np.concatenate([self.last, np.full(len(rows), frame)])
-            self.oriented = np.concatenate([self.oriented, oriented[rows]])
-            self.modes = OrientationModes(
-                *(
-                    np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]])
-                    for name in ("log_weight", "R", "scale")
-                )
-            )
-            self.latent = np.concatenate([self.latent, latent[rows]])
-            self.latent_variance = np.concatenate([self.latent_variance, latent_variance[rows]])
-            self.category = np.concatenate([self.category, category[rows]])
+    def associate(self, measurements: Measurements, frame: int) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Assign one frame's detections (in the world frame) to tracks and found new ones; track and marginal, -1: background."""
+        seen, n = measurements, len(measurements)
+        count = max(seen.modes.log_weight.shape[1], self.modes.log_weight.shape[1])
+        modes, self.modes = seen.modes.padded(count), self.modes.padded(count)
+        log_new = seen.log_object + np.log(self.new_rate)
+        log_clutter = seen.log_clutter + np.log(self.clutter_rate)
+        k, j, value = self._log_odds(seen, modes)
+        found_pairs = frame_marginals(
+            np.zeros(n, dtype=np.int64), k, j, value, np.logaddexp(log_new, log_clutter), associator=self.config.associator
+        )
+        assigned, weight = np.full(n, -1, dtype=np.int64), found_pairs.null.copy()
+        for p in np.flatnonzero(found_pairs.weight > 0.5):
+            i, track = int(k[p]), int(j[p])
+            self._update(track, seen.position[i], seen.covariance[i], seen.latent[i], seen.latent_variance[i], frame)
+            if seen.oriented[i]:
+                self._orient(track, modes.select(np.array([i])), seen.symmetry[[i]])
+            assigned[i], weight[i] = self.index[track], found_pairs.weight[p]
+        # Hopeless ones found no track: the more there are, the more chance pairs.
+        rows = np.flatnonzero((assigned < 0) & (found_pairs.null > 0.5) & (log_new - log_clutter > LEAST_NEW))
+        if len(rows):
+            assigned[rows] = self._found(seen, modes, rows, frame)
         return assigned, weight
+
+    def _log_odds(self, seen: Measurements, modes: OrientationModes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs of detections and tracks inside the gate and their log odds: density over that of any object, per m^3."""
+        gap = seen.position[:, None] - self.mean[None]
+        S = seen.covariance[:, None] + self.covariance[None]
+        k, j = np.nonzero(np.sum(gap**2, axis=2) <= GATE * np.trace(S, axis1=2, axis2=3))
+        square, log_det = squared_distance(gap[k, j], S[k, j])
+        inside = square < GATE
+        k, j = k[inside], j[inside]
+        value = seen.log_object[k] - 0.5 * (square + log_det)[inside]
+        both = np.flatnonzero(seen.oriented[k] & self.oriented[j])
+        if len(both):
+            value[both] += self._orientation(j[both], modes.select(k[both]), seen.symmetry[k[both]])
+        value += self.prior.pair_log_ratio(
+            seen.latent[k],
+            seen.latent_variance[k],
+            seen.category[k],
+            self.latent[j],
+            self.latent_variance[j],
+            self.category[j],
+        )
+        return k, j, value
+
+    def _found(self, seen: Measurements, modes: OrientationModes, rows: np.ndarray, frame: int) -> Int[np.ndarray, " r"]:
+        """New tracks at these detections; their numbers."""
+        new = np.arange(self.total, self.total + len(rows))
+        self.total += len(rows)
+        self.index = np.concatenate([self.index, new])
+        self.mean = np.concatenate([self.mean, seen.position[rows]])
+        self.covariance = np.concatenate([self.covariance, seen.covariance[rows]])
+        self.last = np.concatenate([self.last, np.full(len(rows), frame)])
+        self.oriented = np.concatenate([self.oriented, seen.oriented[rows]])
+        self.modes = OrientationModes(
+            *(np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]]) for name in ("log_weight", "R", "scale"))
+        )
+        self.latent = np.concatenate([self.latent, seen.latent[rows]])
+        self.latent_variance = np.concatenate([self.latent_variance, seen.latent_variance[rows]])
+        self.category = np.concatenate([self.category, seen.category[rows]])
+        return new
 
     def _update(
         self, j: int, position: np.ndarray, covariance: np.ndarray, latent: np.ndarray, latent_variance: np.ndarray, frame: int
@@ -197,13 +182,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
     n = len(table)
     assigned, weight = np.full(n, -1, dtype=np.int64), np.zeros(n)
     if n:
-        R = problem.odometry[table.frame, :3, :3]
-        world = transform(problem.odometry[table.frame], table.position)
-        covariance = R @ noise.position_covariance @ np.swapaxes(R, 1, 2)
-        modes, oriented = observed_modes(table, noise.rotation_scale).turned(R), table.has_rotation
-        latent, latent_variance, category = detection_features(table, noise, prior)
-        symmetry = resolved_symmetry(table, config)
-        objectness = np.clip(table.objectness, *config.objectness_limits)
+        seen = resolve(table, noise, config, prior).in_world(problem.odometry[table.frame])
         order = np.argsort(table.frame, kind="stable")
         frames, starts = np.unique(table.frame[order], return_index=True)
         groups = dict(zip(frames.tolist(), np.split(order, starts[1:])))
@@ -214,18 +193,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
             rows = groups.get(t)
             if rows is None:
                 continue
-            assigned[rows], weight[rows] = tracker.associate(
-                world[rows],
-                covariance[rows],
-                modes.select(rows),
-                oriented[rows],
-                symmetry[rows],
-                latent[rows],
-                latent_variance[rows],
-                category[rows],
-                objectness[rows],
-                t,
-            )
+            assigned[rows], weight[rows] = tracker.associate(seen.select(rows), t)
     return summarise_tracks(problem, noise, config, assigned, weight)
 
 

@@ -20,7 +20,8 @@ from nolbo_ppl.inference.slam.graph import (
     pose_key,
     resolve_observations,
 )
-from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.measurements import Measurements
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 
 RELINEARISE_ROTATION, RELINEARISE_POSITION = 0.05, 10.0
 """Changes in rad and m beyond which a variable is linearised anew."""
@@ -70,7 +71,7 @@ class OnlineGraph:
 
     def observe(
         self,
-        problem: SlamProblem,
+        measurements: Measurements,
         noise: NoiseModel,
         config: SlamConfig,
         rows: list[int],
@@ -78,11 +79,14 @@ class OnlineGraph:
         T_world_camera: Float[np.ndarray, "4 4"],
         landmarks: list[int],
     ) -> None:
-        """Factors of detections of one keyframe (`problem` holds that keyframe alone)."""
+        """Factors of detections of one keyframe (`measurements` hold that keyframe alone)."""
         if not rows:
             return
         estimate = SlamEstimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
-        factors = resolve_observations(problem, noise, config, estimate, np.array(rows), np.arange(len(rows)), np.ones(len(rows)))
+        count = len(rows)
+        factors = resolve_observations(
+            measurements, T_world_camera[None], noise, config, estimate, np.array(rows), np.arange(count), np.ones(count)
+        )
         factors = replace(factors, frame=np.full_like(factors.frame, frame), landmark=np.array(landmarks)[factors.landmark])
         add_observation_factors(self.graph, factors)
 

@@ -15,12 +15,12 @@ from jaxtyping import Float
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
-from nolbo_ppl.inference.slam.detection_features import detection_features, fit_prior, fuse_latent
+from nolbo_ppl.inference.slam.detection_features import fit_prior, fuse_latent
 from nolbo_ppl.inference.slam.incremental.incremental_graph import OnlineGraph
 from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser, Track
 from nolbo_ppl.inference.slam.initialise import init, init_from_tracklets
+from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
-from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
@@ -61,7 +61,7 @@ class IncrementalSlam:
         self.weights: list[np.ndarray] = []
         self.tracks: dict[int, Track] = {}
         self.loops: LoopCloser | None = None
-        self.pending: dict[int, list[tuple[int, SlamProblem, NoiseModel, int]]] = {}
+        self.pending: dict[int, list[tuple[int, Measurements, NoiseModel, int]]] = {}
         self.graph = OnlineGraph()
         self.step_covariances: list[np.ndarray] = []
         self.T_world_camera = np.eye(4)
@@ -98,15 +98,16 @@ class IncrementalSlam:
         self._begin(table)
         noise = self._noise(problem)
         rotation, translation = self._add_pose(odometry, frame, odometry_covariance)
-        assigned, weight = self._track(table, noise, odometry, frame, rotation, translation)
+        measurements = resolve(table, noise, self.config, self.prior)
+        assigned, weight = self._track(measurements, odometry, frame, rotation, translation)
         start = self.seen
         self.odometry.append(odometry)
         self.tables.append(replace(table, frame=np.full(len(table), frame, dtype=np.int64)))
         self.assigned.append(assigned)
         self.weights.append(weight)
         self.seen += len(table)
-        self._remember(table, noise, assigned, start, frame)
-        self._add_factors(problem, noise, assigned, frame)
+        self._remember(measurements, assigned, start, frame)
+        self._add_factors(problem, measurements, noise, assigned, frame)
         self.graph.commit()
         assert self.loops is not None
         closings = self.loops.close(frame, self.graph, noise)
@@ -199,8 +200,7 @@ class IncrementalSlam:
 
     def _track(
         self,
-        table: Detections,
-        noise: NoiseModel,
+        measurements: Measurements,
         odometry: np.ndarray,
         frame: int,
         rotation: float,
@@ -210,34 +210,19 @@ class IncrementalSlam:
         assert tracker is not None
         if frame:
             tracker.predict(odometry, frame, rotation, translation)
-        if not len(table):
+        if not len(measurements):
             return np.zeros(0, dtype=np.int64), np.zeros(0)
-        R = odometry[:3, :3]
-        latent, variance, category = detection_features(table, noise, self.prior)
-        return tracker.associate(
-            transform(odometry, table.position),
-            R @ noise.position_covariance @ R.T,
-            observed_modes(table, noise.rotation_scale).turned(R),
-            table.has_rotation,
-            resolved_symmetry(table, self.config),
-            latent,
-            variance,
-            category,
-            np.clip(table.objectness, *self.config.objectness_limits),
-            frame,
-        )
+        return tracker.associate(measurements.in_world(np.tile(odometry, (len(measurements), 1, 1))), frame)
 
     def _remember(
         self,
-        table: Detections,
-        noise: NoiseModel,
+        measurements: Measurements,
         assigned: np.ndarray,
         start: int,
         frame: int,
     ) -> None:
         """Fuse features of each detection into its track."""
-        latent, variance, category = detection_features(table, noise, self.prior)
-        symmetry = resolved_symmetry(table, self.config)
+        latent, variance = measurements.latent, measurements.latent_variance
         for i, number in enumerate(assigned.tolist()):
             if number < 0:
                 continue
@@ -247,9 +232,9 @@ class IncrementalSlam:
                     -1,
                     latent[i],
                     variance[i],
-                    int(category[i]),
-                    int(symmetry[i]),
-                    bool(table.has_rotation[i]),
+                    int(measurements.category[i]),
+                    int(measurements.symmetry[i]),
+                    bool(measurements.oriented[i]),
                     frame,
                     frame,
                 )
@@ -259,7 +244,9 @@ class IncrementalSlam:
             track.last = frame
             track.latent, track.latent_variance = fuse_latent(track.latent, track.latent_variance, latent[i], variance[i])
 
-    def _add_factors(self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int) -> None:
+    def _add_factors(
+        self, problem: SlamProblem, measurements: Measurements, noise: NoiseModel, assigned: np.ndarray, frame: int
+    ) -> None:
         """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
         rows, landmarks = [], []
         for i, number in enumerate(assigned.tolist()):
@@ -267,16 +254,16 @@ class IncrementalSlam:
                 continue
             track = self.tracks[number]
             if track.landmark < 0 and len(track.rows) < self.config.track_minimum:
-                self.pending.setdefault(number, []).append((frame, problem, noise, i))
+                self.pending.setdefault(number, []).append((frame, measurements, noise, i))
                 continue
             if track.landmark < 0:
                 self._found(track, problem.observations, i)
-                for earlier, its_problem, its_noise, k in self.pending.pop(number, []):
+                for earlier, its_measurements, its_noise, k in self.pending.pop(number, []):
                     pose = self.graph.pose(earlier)
-                    self.graph.observe(its_problem, its_noise, self.config, [k], earlier, pose, [track.landmark])
+                    self.graph.observe(its_measurements, its_noise, self.config, [k], earlier, pose, [track.landmark])
             rows.append(i)
             landmarks.append(track.landmark)
-        self.graph.observe(problem, noise, self.config, rows, frame, self.T_world_camera, landmarks)
+        self.graph.observe(measurements, noise, self.config, rows, frame, self.T_world_camera, landmarks)
         for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
             del self.pending[number]
 
@@ -307,7 +294,7 @@ class IncrementalSlam:
         covariance = np.array(self.step_covariances) if self.step_covariances else None
         problem = SlamProblem(np.array(self.odometry), concatenate(self.tables), covariance)
         noise = estimate_noise(problem, self.config)
-        prior = fit_prior(problem.observations, self.config)
+        prior = fit_prior(problem.observations, self.config, noise)
         tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
         state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
         return complete(state)

@@ -122,6 +122,8 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     volume = view_volume(table)
     seen = max(len(np.unique(table.frame)), 1)
     rate = len(table) / seen / volume if len(table) else 1.0
+    # Where it is calibrated, objectness says how many are false; the marginals of the map correct it later.
+    false = 1.0 - float(np.mean(np.clip(table.objectness, *config.objectness_limits))) if len(table) else 0.1
     return NoiseModel(
         rotation_step=rotation_step,
         translation_step=translation_step,
@@ -129,7 +131,7 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
         rotation_scale=rotation_scale,
         latent_scale=latent_scale,
         new_rate=config.new_rate if config.new_rate is not None else 0.2 * rate,
-        clutter_rate=config.clutter_rate if config.clutter_rate is not None else 0.1 * rate,
+        clutter_rate=config.clutter_rate if config.clutter_rate is not None else false * rate,
         report=report,
         warnings=tuple(warnings),
         step_correlation=correlation,

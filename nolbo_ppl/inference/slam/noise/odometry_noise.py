@@ -93,7 +93,14 @@ def log_evidence(window: SlamState, rotation: float, translation: float) -> floa
     )
     graph = odometry_factors(window.problem, noise)
     factors = resolve_observations(
-        window.problem, noise, window.config, window.estimate, window.rows, window.landmark, window.weight
+        window.measurements,
+        window.problem.odometry,
+        noise,
+        window.config,
+        window.estimate,
+        window.rows,
+        window.landmark,
+        window.weight,
     )
     add_observation_factors(graph, factors, robust_width=ROBUST_WIDTH)
     add_landmark_priors(graph, window.estimate.T_world_landmark, window.typical_range)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, relative, so3_log, transform
 from nolbo_ppl.inference.slam.noise.noise_estimation import TOO_SMALL, robust_scale
-from nolbo_ppl.inference.slam.orientation import nearest_of_modes, observed_modes, resolved_symmetry
+from nolbo_ppl.inference.slam.orientation import nearest_of_modes
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 CLIP = 3.0
@@ -102,8 +102,9 @@ def calibrate(state: SlamState) -> SlamState:
     if len(oriented) >= LEAST_DETECTIONS:
         k, j = rows[oriented], state.landmark[oriented]
         R = relative(state.estimate.T_world_camera[table.frame[k]], state.estimate.T_world_landmark[j])[:, :3, :3]
-        symmetry = resolved_symmetry(table, config)[k]
-        observed = nearest_of_modes(R, observed_modes(table, noise.rotation_scale, k), symmetry)
+        seen = state.measurements.select(k)
+        symmetry = seen.symmetry
+        observed = nearest_of_modes(R, seen.modes, symmetry)
         w = so3_log(np.swapaxes(R, 1, 2) @ observed) / noise.rotation_scale[k][:, None]
         usable = symmetry != 0
         if usable.sum() >= LEAST_DETECTIONS:
