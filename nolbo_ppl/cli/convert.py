@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from nolbo_ppl.cli.convert_archives import Coco, ObjectNet3d, Pascal3d, StanfordCars, Voc
 from nolbo_ppl.data.converters import (
     Converted,
     convert_kitti_object,
@@ -169,14 +170,18 @@ Source = (
     | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
     | Annotated[Photographs, tyro.conf.subcommand("photographs")]
     | Annotated[YcbvSlam, tyro.conf.subcommand("ycbv-slam")]
+    | Annotated[Pascal3d, tyro.conf.subcommand("pascal3d")]
+    | Annotated[ObjectNet3d, tyro.conf.subcommand("objectnet3d")]
+    | Annotated[Voc, tyro.conf.subcommand("voc")]
+    | Annotated[Coco, tyro.conf.subcommand("coco")]
+    | Annotated[StanfordCars, tyro.conf.subcommand("stanford-cars")]
 )
 
 
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
-    source: KittiObject | KittiPoles | KittiTracking | Photographs | YcbvSlam
-    source = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
-    if isinstance(source, KittiObject | Photographs):
+    source: Any = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
+    if hasattr(source, "write"):
         written = source.write()
     else:
         data = source.convert()

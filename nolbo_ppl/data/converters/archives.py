@@ -63,9 +63,7 @@ class ArchiveImage:
     """Categories of which every instance is labelled; None: of all."""
 
 
-def pascal_rotation(
-    viewpoint: Sequence[float], box: Sequence[float], intrinsics: Sequence[float]
-) -> Float[np.ndarray, "3 3"]:
+def pascal_rotation(viewpoint: Sequence[float], box: Sequence[float], intrinsics: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     """R_camera_object of a PASCAL3D+ viewpoint, seen through the middle of a box.
 
     Its camera stands at d (cos e sin a, -cos e cos a, sin e) and the picture is turned by theta counter-clockwise, which is the

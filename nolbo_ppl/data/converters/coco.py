@@ -20,7 +20,9 @@ from nolbo_ppl.io.files import read_json
 def _lists(content: Any, file: Path) -> dict[str, list[dict[str, Any]]]:
     wanted = ("images", "annotations", "categories")
     if not isinstance(content, dict) or not all(isinstance(content.get(name), list) for name in wanted):
-        raise input_error("not a COCO file of instances", expected='{"images": [], "annotations": [], "categories": []}', file=file)
+        raise input_error(
+            "not a COCO file of instances", expected='{"images": [], "annotations": [], "categories": []}', file=file
+        )
     for name in wanted:
         if not all(isinstance(row, dict) and "id" in row for row in content[name]):
             raise input_error(f"{name} of a COCO file", expected="objects with an id", file=file)
@@ -60,7 +62,9 @@ def read_coco(
     things: dict[Any, list[ArchiveObject]] = defaultdict(list)
     for row in content["annotations"]:
         if row.get("category_id") not in names:
-            raise input_error(f"category_id of annotation {row['id']}", got=row.get("category_id"), expected="one listed", file=file)
+            raise input_error(
+                f"category_id of annotation {row['id']}", got=row.get("category_id"), expected="one listed", file=file
+            )
         category = names[row["category_id"]]
         if category is not None:
             things[row.get("image_id")].append(ArchiveObject(category, _box(row, file), difficult=bool(row.get("iscrowd"))))

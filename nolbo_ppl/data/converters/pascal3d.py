@@ -69,7 +69,8 @@ def fine_viewpoint(viewpoint: Any, name: str, file: Path) -> tuple[float, float,
     if np.size(viewpoint.azimuth) == 0 or _numbers(viewpoint.distance, 1, f"{name}.viewpoint.distance", file)[0] == 0:
         return None
     degrees = [
-        _numbers(getattr(viewpoint, angle), 1, f"{name}.viewpoint.{angle}", file)[0] for angle in ("azimuth", "elevation", "theta")
+        _numbers(getattr(viewpoint, angle), 1, f"{name}.viewpoint.{angle}", file)[0]
+        for angle in ("azimuth", "elevation", "theta")
     ]
     azimuth, elevation, theta = np.radians(degrees).tolist()
     return azimuth, elevation, theta
@@ -110,7 +111,9 @@ def read_pascal3d_annotation(
         x0, y0, x1, y1 = _numbers(getattr(thing, "bbox", None), 4, f"{where}.bbox", file)
         viewpoint = fine_viewpoint(getattr(thing, "viewpoint", None), where, file)
         index = np.atleast_1d(getattr(thing, "cad_index", np.array([]))).ravel()
-        instance = f"{name}/{int(index[0]):02d}" if len(index) and np.issubdtype(index.dtype, np.number) and index[0] > 0 else None
+        instance = (
+            f"{name}/{int(index[0]):02d}" if len(index) and np.issubdtype(index.dtype, np.number) and index[0] > 0 else None
+        )
         objects.append(
             ArchiveObject(
                 category,

@@ -36,7 +36,9 @@ def _parse(file: Path) -> ElementTree.Element:
     if not file.is_file():
         raise input_error("no such annotation", file=file)
     if file.stat().st_size > MOST_BYTES:
-        raise input_error("size of an annotation", got=f"{file.stat().st_size} bytes", expected=f"at most {MOST_BYTES}", file=file)
+        raise input_error(
+            "size of an annotation", got=f"{file.stat().st_size} bytes", expected=f"at most {MOST_BYTES}", file=file
+        )
     text = file.read_bytes()
     if b"<!ENTITY" in text or b"<!DOCTYPE" in text:  # entities that expand without end
         raise input_error("an XML file with a document type", expected="plain elements, as VOC writes them", file=file)
@@ -121,9 +123,10 @@ def read_voc(
         listing = root / "ImageSets" / "Main" / f"{split}.txt"
         if not listing.is_file():
             raise input_error("no such split", got=split, expected="a file of ImageSets/Main", file=listing)
-        files = [annotations / f"{line.split()[0]}.xml" for line in listing.read_text(encoding="utf-8").splitlines() if line.strip()]
+        files = [
+            annotations / f"{line.split()[0]}.xml" for line in listing.read_text(encoding="utf-8").splitlines() if line.strip()
+        ]
     if not files:
         raise input_error("a folder without annotations", file=annotations)
     for file in files:
         yield read_voc_annotation(file, root / "JPEGImages", categories)
-

@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.io import savemat
 
 from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.cli import main
 from nolbo_ppl.data.converters.archives import ArchiveImage, ArchiveObject, pascal_rotation, scene_line, write_archive
 from nolbo_ppl.data.converters.coco import read_coco
 from nolbo_ppl.data.converters.pascal3d import cad_files, read_objectnet3d, read_pascal3d, read_pascal3d_annotation
@@ -18,6 +19,7 @@ from nolbo_ppl.data.converters.voc import read_voc, read_voc_annotation
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, geodesic_angle, matrix_to_viewpoint, quaternion_to_matrix
+from nolbo_ppl.geometry.voxels import unpack_voxels
 
 CAMERA = [100.0, 100.0, 50.0, 40.0]
 
@@ -32,9 +34,7 @@ def benchmark_projection(points: np.ndarray, azimuth: float, elevation: float, t
 
     The camera stands at (cos e sin a, -cos e cos a, sin e) and looks at the origin with z up; then the picture is turned.
     """
-    eye = np.array(
-        [np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth), np.sin(elevation)]
-    )
+    eye = np.array([np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth), np.sin(elevation)])
     right = np.cross(-eye, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     up = np.cross(right, -eye)
@@ -106,7 +106,9 @@ def make_pascal(root: Path) -> None:
     (lists / "car_val.txt").write_text("p9  1\n")
     for index in (3, 4):
         (root / "CAD" / "car").mkdir(parents=True, exist_ok=True)
-        (root / "CAD" / "car" / f"{index:02d}.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+        (root / "CAD" / "car" / f"{index:02d}.off").write_text(
+            "OFF\n4 4 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+        )
 
 
 def test_pascal3d_as_it_is_distributed(tmp_path: Path) -> None:
@@ -133,6 +135,19 @@ def test_objects_without_a_viewpoint_stay_and_benchmarks_ignore_what_is_cut(tmp_
     assert counts == {"images": 2, "objects": 2, "viewpoints": 2, "ignore": 2}
     scenes = SceneFolder(tmp_path / "all")
     assert len(scenes) == 2
+
+
+def test_the_command_writes_scenes_with_their_shapes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_pascal(tmp_path / "data")
+    main(["convert", "pascal3d", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "scenes")])
+    assert "2 images, 4 objects, 2 viewpoints" in capsys.readouterr().out
+    with np.load(tmp_path / "scenes" / "voxels.npz", allow_pickle=False) as voxels:
+        assert set(voxels.files) == {"car/03", "car/04"}
+        assert unpack_voxels(voxels["car/03"], 32).any()
+    batch = SceneFolder(tmp_path / "scenes").batch(np.array([0]))
+    assert batch["has_voxels"][0, :2].all()
+    assert batch["has_viewpoint"][0, :2].tolist() == [True, False]
+    np.testing.assert_allclose(batch["viewpoint"][0, 0], np.radians([30.0, 10.0, 5.0]), atol=1e-6)
 
 
 def test_objectnet3d_takes_one_list_for_all_classes(tmp_path: Path) -> None:
