@@ -38,7 +38,7 @@ def load(name_or_path: str | PathLike[str] = "tiny") -> ObservationModel:
         raise input_error("not a model configuration", expected='{"model": {...}, ...}', file=folder / "config.json")
     model = Nolbo.from_seed(ModelConfig.from_json(values["model"]), seed=0)
     tensors, _ = load_tensors(folder / "model.safetensors")
-    load_strictly(model, {name: tensor.float() for name, tensor in tensors.items()}, folder / "model.safetensors")
+    load_strictly(model, tensors, folder / "model.safetensors")
     return ObservationModel(model, Calibration.from_json(values.get("calibration", {})))
 
 
