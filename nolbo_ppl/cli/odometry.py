@@ -15,7 +15,7 @@ from nolbo_ppl._version import __version__
 from nolbo_ppl.data.sequences import FrameSequence, open_frames, read_intrinsics, read_lengths
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, write_json
-from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, poses_of_frames, write_trajectory
+from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, read_frame_poses, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, path_length
 from nolbo_ppl.odometry import (
     GroundHeight,
@@ -92,13 +92,13 @@ def frame_times(part: Part) -> np.ndarray | None:
 
 
 def true_poses(path: Path, part: Part) -> np.ndarray:
-    """True poses of the frames.
+    """True poses of the frames, NaN where they are not known.
 
     Raises:
         InputError: rows that match the sequence neither in number nor by time.
     """
     rows = slice(part.first, part.first + len(part))
-    return poses_of_frames(path, len(part.frames), part.frames.times, rows)
+    return read_frame_poses(path, len(part.frames), part.frames.times, rows).T_world_camera
 
 
 def known_lengths(path: Path, part: Part) -> np.ndarray:
@@ -121,6 +121,8 @@ def scale_of(arguments: OdometryArguments, part: Part, truth: np.ndarray | None)
     if arguments.scale == "truth":
         if truth is None:
             raise input_error("--scale truth without a trajectory", do="give --truth FILE")
+        if not np.isfinite(truth).all():
+            raise input_error("--scale truth with gaps in the truth", expected="a pose for every frame", do="take --scale file")
         return KnownLengths(lengths_of(truth))
     if arguments.scale == "file":
         if arguments.lengths is None:

@@ -11,7 +11,8 @@ import tyro
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import write_result
 from nolbo_ppl.io.observations import read_observations
-from nolbo_ppl.io.trajectories import poses_of_frames, read_covariance, read_trajectory
+from nolbo_ppl.io.trajectories import TIME_TOLERANCE, read_covariance, read_frame_poses, read_trajectory
+from nolbo_ppl.io.trajectory_tables import TableFormat
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class SlamArguments:
     """Correct a drifting trajectory by the objects seen along it, and map them with uncertainty."""
 
     odometry: Path
-    """Odometry: KITTI (12 numbers a row) or TUM (`time x y z qx qy qz qw`), T_world_camera, x right, y down, z forward."""
+    """Odometry: KITTI (12 numbers a row), 4 x 4 (16), TUM (`time x y z qx qy qz qw`) or EuRoC (CSV, ns, q_w first);
+    T_world_camera, x right, y down, z forward."""
     observations: Path
     """Observations: JSON Lines, one detection a line (see docs/slam.md)."""
     out: Path
@@ -28,7 +30,16 @@ class SlamArguments:
     """Covariance of every odometry step: NPZ with `covariance` [n - 1, 6, 6], [rotation rad, translation m] at the later
     camera."""
     truth: Path | None = None
-    """True trajectory, for errors before and after: rows of the odometry, or TUM rows matched by time."""
+    """True trajectory, for errors before and after: matched by time where both have times, else row by row. Frames without
+    truth, and rows of nothing but nan or inf, are left out of the errors."""
+    odometry_format: TableFormat | None = None
+    """Format of the odometry, where it is not to be told from the file."""
+    truth_format: TableFormat | None = None
+    """Format of the truth, where it is not to be told from the file."""
+    truth_interpolation: bool = False
+    """Take the truth between two of its rows, at most 1 s apart, instead of the row nearest in time."""
+    time_tolerance: float = TIME_TOLERANCE
+    """How far, in s, a frame and its true pose may lie apart."""
     model: str | None = None
     """Model (a name or a folder) that decodes the landmarks' latents into landmarks_voxels.npz."""
     online: bool = False
@@ -43,11 +54,20 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     Raises:
         NolboError: bad input, or a graph that cannot be solved; nothing half-written is left.
     """
-    odometry = read_trajectory(arguments.odometry)
+    odometry = read_trajectory(arguments.odometry, arguments.odometry_format)
     table = read_observations(arguments.observations, frames=len(odometry))
-    truth = None
+    truth, remarks = None, []
     if arguments.truth is not None:
-        truth = poses_of_frames(arguments.truth, len(odometry), odometry.times, of="the odometry")
+        found = read_frame_poses(
+            arguments.truth,
+            len(odometry),
+            odometry.times,
+            form=arguments.truth_format,
+            tolerance=arguments.time_tolerance,
+            interpolate=arguments.truth_interpolation,
+            of="the odometry",
+        )
+        truth, remarks = found.T_world_camera, found.remarks()
     covariance = None if arguments.odometry_covariance is None else read_covariance(arguments.odometry_covariance)
     problem = SlamProblem(odometry.T_world_camera, table, covariance)
     model = None
@@ -65,7 +85,7 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
 
     report = write_result(arguments.out, result, odometry, truth, model=model)
     draw_slam_result(arguments.out / "map.png", odometry.T_world_camera, result, truth)
-    return result, report
+    return result, report | {"remarks": remarks}
 
 
 def describe(report: dict[str, object]) -> str:
@@ -77,8 +97,9 @@ def describe(report: dict[str, object]) -> str:
     before, after = report.get("before"), report.get("after")
     if isinstance(before, dict) and isinstance(after, dict):
         lines.append(f"ATE {before['ate']:.3f} m -> {after['ate']:.3f} m")
-    warnings = report["warnings"]
-    lines += [f"warning: {text}" for text in (warnings if isinstance(warnings, list) else [])]
+    for kind, name in (("remarks", ""), ("warnings", "warning: ")):
+        texts = report.get(kind, [])
+        lines += [name + text for text in (texts if isinstance(texts, list) else [])]
     return "\n".join(lines)
 
 

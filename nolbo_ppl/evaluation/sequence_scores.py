@@ -16,7 +16,7 @@ from nolbo_ppl.inference.slam.detection_features import weighted_latents
 from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.calibration import chi_square_mass, coverage
-from nolbo_ppl.metrics.trajectory import umeyama
+from nolbo_ppl.metrics.trajectory import known_rows, pose_alignment
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture
@@ -228,8 +228,12 @@ def landmark_errors(
     estimate: Float[np.ndarray, "n 4 4"],
     T_world_camera: Float[np.ndarray, "n 4 4"],
 ) -> Float[np.ndarray, " m"]:
-    """Distance of each landmark from its object, m, after the estimated path was laid onto the true one; NaN without one."""
-    R, t, _ = umeyama(estimate[:, :3, 3], T_world_camera[:, :3, 3])
+    """Distance of each landmark from its object, m, after the estimated path was laid onto the true one; NaN without one.
+
+    Positions of a straight road say nothing of a turn about it, which moves whatever stands beside it: orientations do.
+    """
+    both = known_rows(T_world_camera)
+    R, t = pose_alignment(estimate[both], T_world_camera[both])
     placed = position @ R.T + t
     known = (owner >= 0) & ~truth.moving[owner]
     return np.where(known, np.linalg.norm(placed - truth.T_world_object[owner, :3, 3], axis=1), np.nan)

@@ -1,5 +1,5 @@
-"""Trajectories on disk: KITTI (12 numbers a row) and TUM (`time x y z qx qy qz qw`), poses `T_world_camera`; what belongs to
-their rows: frames of a sequence, covariances of the steps."""
+"""Trajectories on disk (KITTI, TUM, EuRoC, 4 x 4 matrices), poses `T_world_camera`; what belongs to their rows: frames of a
+sequence, covariances of the steps."""
 
 from __future__ import annotations
 
@@ -9,19 +9,25 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.pose import is_rotation, make_pose, matrix_to_quaternion, nearest_rotation, quaternion_to_matrix
-from nolbo_ppl.io.files import atomic_path, read_text
+from nolbo_ppl.geometry.pose import matrix_to_quaternion, relative, se3_exp, se3_log
+from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.io.images import natural
 from nolbo_ppl.io.npz import read_npz
+from nolbo_ppl.io.text import read_lines
+from nolbo_ppl.io.trajectory_tables import TableFormat, parse_table
 
 TrajectoryFormat = Literal["kitti", "tum"]
+"""What is written: TUM where there are times, KITTI where there are none."""
 Covariances = Float[np.ndarray, "n-1 6 6"]
 COVARIANCE = "odometry_covariance.npz"
 """File of the covariances of an odometry's steps, beside it."""
 TIME_TOLERANCE = 0.02
 """How far, in s, the times of a frame and its pose may lie apart."""
+LONGEST_GAP = 1.0
+"""Longest time, in s, between two poses of a truth that is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -29,88 +35,78 @@ class Trajectory:
     """Poses of a camera, row by row."""
 
     T_world_camera: Float[np.ndarray, "n 4 4"]
-    """Body-to-world poses; camera x right, y down, z forward."""
+    """Body-to-world poses; camera x right, y down, z forward. NaN where a truth was lost."""
     times: Float[np.ndarray, " n"] | None = None
-    """Time stamps in seconds (TUM only)."""
+    """Time stamps in seconds."""
     format: TrajectoryFormat = "kitti"
-    """The format it was read in, used again to write."""
+    """The format it is written in."""
+    numbers: Float[np.ndarray, " n"] | None = None
+    """Numbers of the frames, where the file gives them."""
+    repeated_stamps: int = 0
+    """Rows left out because they repeat the time of the row before."""
 
     def __len__(self) -> int:
         return len(self.T_world_camera)
 
-
-def _numbers(path: Path) -> list[tuple[int, list[float]]]:
-    """Line numbers and values of a table of numbers; comments and blank lines are skipped."""
-    rows = []
-    lines = read_text(path).splitlines()
-    for number, text in enumerate(lines, start=1):
-        text = text.split("#", 1)[0].replace(",", " ").strip()
-        if not text:
-            continue
-        try:
-            values = [float(word) for word in text.split()]
-        except ValueError:
-            raise input_error("not a row of numbers", got=repr(text[:80]), file=path, line=number) from None
-        if not np.isfinite(values).all():
-            raise input_error("a value is not finite", got=repr(text[:80]), file=path, line=number)
-        rows.append((number, values))
-    if not rows:
-        raise input_error("the trajectory is empty", file=path)
-    return rows
+    @property
+    def known(self) -> Bool[np.ndarray, " n"]:
+        """Rows that hold a pose."""
+        return np.isfinite(self.T_world_camera).all(axis=(1, 2))
 
 
-def read_trajectory(path: str | PathLike[str]) -> Trajectory:
-    """Read a KITTI or TUM trajectory, told apart by the length of its rows.
+def read_trajectory(
+    path: str | PathLike[str], form: TableFormat | None = None, *, lost: bool = False, repeated: bool = False
+) -> Trajectory:
+    """Read a trajectory: KITTI, TUM, EuRoC or TUM-VI, 4 x 4 matrices a row, in blocks, or in a folder of one file a frame.
 
-    Rotations that are orthonormal to three digits are made exactly so; quaternions may be off unit length by 1 %.
+    Formats are told apart by the length of the rows, those with quaternions by the names of the header, or by commas and
+    times in ns (see `nolbo_ppl.io.trajectory_tables`).
+
+    Args:
+        path: the file, or the folder of one 4 x 4 matrix a file (ScanNet's `pose/`).
+        form: the format, where it is not to be told from the file.
+        lost: rows of nothing but nan or inf are poses that are not known (NaN), as a truth may have.
+        repeated: equal times in a row are harmless: the first is kept, the others are counted.
 
     Raises:
         InputError: missing, empty, a malformed or truncated row, NaN, no rotation, a non-unit quaternion, times that do
             not increase; names file and line.
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> file = pathlib.Path(tempfile.mkdtemp()) / "mocap.csv"
+        >>> _ = file.write_text("1403636579763555584,1,2,3,0.6,0.8,0,0\\n")  # q_w first: commas and ns
+        >>> read_trajectory(file).T_world_camera[0, 2].round(2).tolist()
+        [0.0, 0.96, -0.28, 3.0]
     """
     path = Path(path)
-    rows = _numbers(path)
-    width = len(rows[0][1])
-    if width not in (8, 12):
-        raise input_error(
-            "unknown trajectory format",
-            got=f"{width} numbers a row",
-            expected="12 (KITTI) or 8 (TUM)",
-            file=path,
-            line=rows[0][0],
-        )
-    for number, values in rows:
-        if len(values) != width:
-            raise input_error(
-                "row of another length",
-                got=f"{len(values)} numbers",
-                expected=width,
-                do="is the file truncated?",
-                file=path,
-                line=number,
-            )
-    table = np.array([values for _, values in rows])
-    lines = [number for number, _ in rows]
-    if width == 12:
-        matrices = table.reshape(-1, 3, 4)
-        good = is_rotation(matrices[:, :, :3], tolerance=1e-2)
-        if not good.all():
-            raise input_error(
-                "the left 3x3 block is no rotation",
-                expected="orthonormal, determinant +1",
-                file=path,
-                line=lines[int(np.argmin(good))],
-            )
-        return Trajectory(make_pose(nearest_rotation(matrices[:, :, :3]), matrices[:, :, 3]))
-    norms = np.linalg.norm(table[:, 4:], axis=1)
-    if (np.abs(norms - 1) > 1e-2).any():
-        row = int(np.argmax(np.abs(norms - 1)))
-        raise input_error("quaternion of another length than 1", got=f"{norms[row]:.4g}", file=path, line=lines[row])
-    backwards = np.diff(table[:, 0]) <= 0
-    if backwards.any():
-        row = int(np.argmax(backwards)) + 1
-        raise input_error("time does not increase", got=f"{table[row, 0]!r}", file=path, line=lines[row])
-    return Trajectory(make_pose(quaternion_to_matrix(table[:, 4:]), table[:, 1:4]), times=table[:, 0], format="tum")
+    if path.is_dir():
+        return _folder_of_poses(path, lost)
+    found = parse_table(path, read_lines(path), form, lost=lost)
+    if found.times is None:
+        return Trajectory(found.T_world_camera, numbers=found.numbers)
+    step = np.diff(found.times)
+    wrong = step < 0 if repeated else step <= 0
+    if wrong.any():
+        row = int(np.argmax(wrong)) + 1
+        got = f"{found.times[row]:.9f}".rstrip("0")
+        raise input_error("time does not increase", got=got, file=path, line=int(found.lines[row]))
+    keep = np.concatenate([[True], step > 0])
+    return Trajectory(found.T_world_camera[keep], found.times[keep], "tum", repeated_stamps=int((~keep).sum()))
+
+
+def _folder_of_poses(folder: Path, lost: bool) -> Trajectory:
+    """One 4 x 4 matrix a file, in natural order of the names."""
+    files = [path for path in sorted(folder.glob("*.txt"), key=natural) if not path.name.startswith(".")]
+    if not files:
+        raise input_error("no pose in the folder", expected="one .txt of 4 rows of 4 numbers a frame", file=folder)
+    poses = []
+    for path in files:
+        found = parse_table(path, read_lines(path), "matrix", lost=lost)
+        if len(found.T_world_camera) != 1:
+            raise input_error("several poses in one file of a folder", got=len(found.T_world_camera), expected=1, file=path)
+        poses.append(found.T_world_camera[0])
+    return Trajectory(np.array(poses))
 
 
 def write_trajectory(path: str | PathLike[str], trajectory: Trajectory) -> None:
@@ -146,46 +142,157 @@ def match_times(
     return rows, nearest[rows]
 
 
+def interpolate_poses(
+    times: Float[np.ndarray, " n"],
+    T: Float[np.ndarray, "n 4 4"],
+    at: Float[np.ndarray, " m"],
+    longest_gap: float = LONGEST_GAP,
+) -> Float[np.ndarray, "m 4 4"]:
+    """Poses between poses, along the rigid motion of constant velocity from one to the next; NaN across longer gaps.
+
+    Args:
+        times: rising times, s.
+        T: poses at these times.
+        at: times of the poses wanted; nothing is known before the first and after the last.
+        longest_gap: longest time, s, from one pose to the next.
+    """
+    out = np.full((len(at), 4, 4), np.nan)
+    after = np.searchsorted(times, at)
+    on = np.minimum(after, len(times) - 1)
+    exact = times[on] == at
+    out[exact] = T[on[exact]]
+    inside = ~exact & (after > 0) & (after < len(times))
+    before = after[inside] - 1
+    span = times[before + 1] - times[before]
+    rows = np.flatnonzero(inside)[span <= longest_gap]
+    before, span = before[span <= longest_gap], span[span <= longest_gap]
+    share = (at[rows] - times[before]) / span
+    out[rows] = T[before] @ se3_exp(share[:, None] * se3_log(relative(T[before], T[before + 1])))
+    return out
+
+
+@dataclass(frozen=True)
+class FramePoses:
+    """Poses of the frames of a sequence, those that are known, and how they were found."""
+
+    T_world_camera: Float[np.ndarray, "n 4 4"]
+    """A row a frame; NaN where the file has no pose for it."""
+    matched_by: Literal["row", "number", "time"]
+    """What laid rows of the file on frames."""
+    repeated_stamps: int = 0
+    """Rows of the file left out because they repeat a time."""
+    lost: int = 0
+    """Rows of the file that hold no pose (nan or inf)."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, " n"]:
+        """Frames with a pose."""
+        return np.isfinite(self.T_world_camera).all(axis=(1, 2))
+
+    def remarks(self, what: str = "truth") -> list[str]:
+        """What a reader of the figures has to know: frames without a pose, rows left out."""
+        found = []
+        if not self.known.all():
+            found.append(f"{what}: {int(self.known.sum())} of {len(self.known)} frames have a pose; figures are over these")
+        if self.lost:
+            found.append(f"{what}: {self.lost} rows hold no pose (nan or inf)")
+        if self.repeated_stamps:
+            found.append(f"{what}: {self.repeated_stamps} rows repeat a time; the first of each is taken")
+        return found
+
+
+def read_frame_poses(
+    path: str | PathLike[str],
+    frames: int,
+    times: Float[np.ndarray, " f"] | None = None,
+    part: slice = slice(None),
+    *,
+    form: TableFormat | None = None,
+    tolerance: float = TIME_TOLERANCE,
+    interpolate: bool = False,
+    lost: bool = True,
+    what: str = "truth",
+    of: str = "the frames",
+) -> FramePoses:
+    """Poses of a sequence's frames, or of a part of them. Where both sides have times, times alone decide.
+
+    Without times on one side, numbers of frames decide, or the rows: one for each frame, or one for each of the part.
+
+    Args:
+        path: the trajectory.
+        frames: number of frames of the sequence.
+        times: their times, s, where all are known.
+        part: the frames wanted.
+        form: the file's format, where it is not to be told from the file.
+        tolerance: how far, s, a frame and its pose may lie apart.
+        interpolate: take poses between two rows of the file no more than `LONGEST_GAP` apart, instead of the nearest.
+        lost: rows of nothing but nan or inf are poses that are not known.
+        what: what the trajectory is, for the messages.
+        of: what the frames are, for the messages.
+
+    Raises:
+        InputError: the trajectory is malformed, matches neither in number nor by time, or has no pose for any frame;
+            names the file.
+    """
+    found, wanted = read_trajectory(path, form, lost=lost, repeated=True), range(frames)[part]
+    count = len(wanted)
+    unknown = np.full((frames, 4, 4), np.nan)
+    if found.times is not None and times is not None:
+        at, known = times[part], found.known
+        if interpolate:
+            T = interpolate_poses(found.times[known], found.T_world_camera[known], at)
+        else:
+            T = unknown[:count]
+            rows, partner = match_times(at, found.times[known], tolerance)
+            T[rows] = found.T_world_camera[known][partner]
+        if not np.isfinite(T).any():
+            raise input_error(
+                f"{what} has no time of {of}",
+                got=f"{found.times[0]:.3f} s to {found.times[-1]:.3f} s",
+                expected=f"times within {at[0]:.3f} s to {at[-1]:.3f} s",
+                do="do both clocks start at the same instant?",
+                file=path,
+            )
+        return FramePoses(T, "time", found.repeated_stamps, int((~known).sum()))
+    lost_rows = int((~found.known).sum())
+    if found.numbers is not None and len(found) != frames and found.numbers[-1] < frames:
+        unknown[found.numbers] = found.T_world_camera
+        answer = FramePoses(unknown[part], "number", 0, lost_rows)
+    elif len(found) in (frames, count) and not found.repeated_stamps:
+        answer = FramePoses(found.T_world_camera[part if len(found) == frames else slice(None)], "row", 0, lost_rows)
+    else:
+        expected = f"{frames} rows" + ("" if (found.times is None) == (times is None) else ", or times on both sides")
+        raise input_error(f"{what} does not match {of} row by row", got=f"{len(found)} rows", expected=expected, file=path)
+    if not answer.known.any():
+        raise input_error(f"{what} has no pose of {of}", got=f"{len(found)} rows, none with a pose", file=path)
+    return answer
+
+
 def poses_of_frames(
     path: str | PathLike[str],
     frames: int,
     times: Float[np.ndarray, " f"] | None = None,
     part: slice = slice(None),
     *,
+    form: TableFormat | None = None,
+    tolerance: float = TIME_TOLERANCE,
     what: str = "truth",
     of: str = "the frames",
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Poses of a sequence's frames, or of a part of them: rows in the order of the frames, or TUM rows matched by time.
-
-    Args:
-        path: the trajectory: a row for each frame of the sequence, one for each of the part, or rows with times.
-        frames: number of frames of the sequence.
-        times: their times, s, where all are known.
-        part: the frames wanted.
-        what: what the trajectory is, for the messages.
-        of: what the frames are, for the messages.
+    """`read_frame_poses` where every frame needs a pose.
 
     Raises:
-        InputError: the trajectory is malformed, or matches neither in number nor by time; names the file.
+        InputError: as there, or a frame without a pose; names the file.
     """
-    found, count = read_trajectory(path), len(range(frames)[part])
-    if len(found) == frames:
-        return found.T_world_camera[part]
-    if len(found) == count:
-        return found.T_world_camera
-    if found.times is None or times is None:
-        raise input_error(
-            f"{what} does not match {of} row by row", got=f"{len(found)} rows", expected=f"{frames} rows", file=path
-        )
-    rows, partner = match_times(times[part], found.times)
-    if len(rows) < count:
+    found = read_frame_poses(path, frames, times, part, form=form, tolerance=tolerance, lost=False, what=what, of=of)
+    if not found.known.all():
         raise input_error(
             f"{what} lacks times of {of}",
-            got=f"{len(rows)} of {count} matched within {1000 * TIME_TOLERANCE:.0f} ms",
+            got=f"{int(found.known.sum())} of {len(found.known)} matched within {1000 * tolerance:.0f} ms",
             expected="a pose for each",
             file=path,
         )
-    return found.T_world_camera[partner]
+    return found.T_world_camera
 
 
 def read_covariance(path: str | PathLike[str]) -> Covariances:

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, relative, rotation_angle
 
-Alignment = Literal["none", "origin", "se3", "sim3"]
+Alignment = Literal["none", "origin", "se3", "sim3", "pose"]
+"""`se3` and `sim3` lay positions on positions (Umeyama); `pose` is `se3` in which the cameras' orientations, with little
+weight, decide what positions leave open: the turn about a straight road."""
+LEVER = 0.1
+"""Length of the arms that stand for an orientation in the alignment `pose`, in root mean square extents of the path: a
+hundredth of the positions' weight."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +72,38 @@ def umeyama(
     return R, mean_target - scale * R @ mean_source, scale  # eq. 41
 
 
-def _validated(T_estimate: np.ndarray, T_truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pose_alignment(
+    T_source: Float[np.ndarray, "n 4 4"], T_target: Float[np.ndarray, "n 4 4"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    """Rotation and translation that lay poses on poses: positions, and the ends of short arms along the cameras' axes.
+
+    Positions alone leave the turn about a straight road open, which moves landmarks beside the road and turns every
+    camera; the arms settle it. They are `LEVER` of the path's extent long, so that they hardly weigh where positions say
+    something; a path of one place is aligned by orientation.
+    """
+    source = T_source[:, :3, 3]
+    extent = float(np.sqrt(np.mean(np.sum((source - source.mean(axis=0)) ** 2, axis=1))))
+    arm = LEVER * extent if extent > 0 else 1.0
+    ends = [
+        np.concatenate([T[:, :3, 3], *(T[:, :3, 3] + sign * arm * T[:, :3, k] for k in range(3) for sign in (-1, 1))])
+        for T in (T_source, T_target)
+    ]
+    R, t, _ = umeyama(ends[0], ends[1])
+    return R, t
+
+
+def known_rows(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, " n"]:
+    """Rows of a trajectory that hold a pose: rows of nothing but NaN are not known."""
+    return ~np.isnan(T).all(axis=(1, 2))
+
+
+def _validated(T_estimate: np.ndarray, T_truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both trajectories, and the rows in which both are known."""
     T_estimate, T_truth = np.asarray(T_estimate, dtype=np.float64), np.asarray(T_truth, dtype=np.float64)
     for name, T in (("estimate", T_estimate), ("truth", T_truth)):
         if T.ndim != 3 or T.shape[1:] != (4, 4):
             raise input_error(f"{name} is no trajectory", got=f"shape {T.shape}", expected="[n, 4, 4]")
-        if not np.isfinite(T).all():
+        if not np.isfinite(T[known_rows(T)]).all():
             raise input_error(f"{name} holds values that are not finite")
     if len(T_estimate) != len(T_truth) or len(T_truth) == 0:
         raise input_error(
@@ -81,7 +112,10 @@ def _validated(T_estimate: np.ndarray, T_truth: np.ndarray) -> tuple[np.ndarray,
             expected=f"{len(T_truth)} as in the truth, at least one",
             do="pass rows of the same instants",
         )
-    return T_estimate, T_truth
+    both = known_rows(T_estimate) & known_rows(T_truth)
+    if not both.any():
+        raise input_error("no row with both an estimate and a truth", expected="at least one")
+    return T_estimate, T_truth, both
 
 
 def align(
@@ -89,17 +123,24 @@ def align(
 ) -> Float[np.ndarray, "n 4 4"]:
     """The estimate moved onto the truth: not at all, by its first pose, by a rigid motion, or with scale.
 
+    Rows of nothing but NaN, on either side, are unknown: the others decide.
+
     Raises:
         InputError: shapes differ, no rows, values not finite, or an unknown alignment.
     """
-    T_estimate, T_truth = _validated(T_estimate, T_truth)
+    T_estimate, T_truth, both = _validated(T_estimate, T_truth)
     if alignment == "none":
         return T_estimate
     if alignment == "origin":
-        return (T_truth[0] @ inverse(T_estimate[0])) @ T_estimate
-    if alignment not in ("se3", "sim3"):
-        raise input_error("unknown alignment", got=alignment, expected="none, origin, se3 or sim3")
-    R, t, scale = umeyama(T_estimate[:, :3, 3], T_truth[:, :3, 3], with_scale=alignment == "sim3")
+        first = int(np.argmax(both))
+        return (T_truth[first] @ inverse(T_estimate[first])) @ T_estimate
+    if alignment not in ("se3", "sim3", "pose"):
+        raise input_error("unknown alignment", got=alignment, expected="none, origin, se3, sim3 or pose")
+    if alignment == "pose":
+        R, t = pose_alignment(T_estimate[both], T_truth[both])
+        scale = 1.0
+    else:
+        R, t, scale = umeyama(T_estimate[both, :3, 3], T_truth[both, :3, 3], with_scale=alignment == "sim3")
     aligned = T_estimate.copy()
     aligned[:, :3, :3] = R @ T_estimate[:, :3, :3]
     aligned[:, :3, 3] = scale * T_estimate[:, :3, 3] @ R.T + t
@@ -112,11 +153,14 @@ def absolute_trajectory_error(
     """Distance between estimated and true positions in m after alignment (Sturm et al. 2012; evo's APE, translation
     part).
 
+    Rows in which one of both is unknown (nothing but NaN) are left out; `count` says over how many the error is.
+
     Raises:
         InputError: shapes differ, no rows, values not finite, or an unknown alignment.
     """
     aligned = align(T_estimate, T_truth, alignment)
-    return summarise(np.linalg.norm(aligned[:, :3, 3] - np.asarray(T_truth)[:, :3, 3], axis=1))
+    distance = np.linalg.norm(aligned[:, :3, 3] - np.asarray(T_truth)[:, :3, 3], axis=1)
+    return summarise(distance[np.isfinite(distance)])
 
 
 def relative_pose_error(
@@ -127,15 +171,19 @@ def relative_pose_error(
 ) -> ErrorSummary:
     """Error of the motion over `delta` rows, in m or rad: `(Q_i^-1 Q_i+d)^-1 (P_i^-1 P_i+d)` (Sturm et al. 2012).
 
-    Pairs follow one another without overlap for delta > 1 (0, d, 2d, ...), as evo does by default. Needs no alignment.
+    Pairs follow one another without overlap for delta > 1 (0, d, 2d, ...), as evo does by default. Needs no alignment. Pairs
+    of which a row is unknown (nothing but NaN) are left out.
 
     Raises:
-        InputError: shapes differ, or fewer rows than `delta + 1`.
+        InputError: shapes differ, fewer rows than `delta + 1`, or no pair of known rows.
     """
-    T_estimate, T_truth = _validated(T_estimate, T_truth)
+    T_estimate, T_truth, both = _validated(T_estimate, T_truth)
     if delta < 1 or len(T_truth) <= delta:
         raise input_error("no pair of rows at this distance", got=f"delta {delta}", expected=f"1 to {len(T_truth) - 1}")
     first = np.arange(0, len(T_truth) - delta, delta)
+    first = first[both[first] & both[first + delta]]
+    if not len(first):
+        raise input_error("no pair of known rows at this distance", got=f"delta {delta}")
     motion = relative(T_estimate[first], T_estimate[first + delta])
     motion_true = relative(T_truth[first], T_truth[first + delta])
     error = relative(motion_true, motion)
@@ -145,5 +193,5 @@ def relative_pose_error(
 
 
 def path_length(T: Float[np.ndarray, "n 4 4"]) -> float:
-    """Length of the way in m."""
-    return float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
+    """Length of the way in m, straight across rows that are unknown (nothing but NaN)."""
+    return float(np.linalg.norm(np.diff(T[known_rows(T), :3, 3], axis=0), axis=1).sum())

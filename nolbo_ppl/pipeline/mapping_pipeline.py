@@ -96,7 +96,7 @@ class ObjectMappingPipeline:
     def truth(self) -> np.ndarray | None:
         """True poses of the keyframes."""
         path = self.out / "truth.txt"
-        return read_trajectory(path).T_world_camera if path.is_file() else None
+        return read_trajectory(path, lost=True).T_world_camera if path.is_file() else None
 
     # -- stages -------------------------------------------------------------------------------------------------------
 

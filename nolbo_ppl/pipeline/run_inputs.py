@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 
 from nolbo_ppl.data.sequences import CameraIntrinsics, FrameSequence, ImageFolder, open_frames, read_camera, read_lengths
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.trajectories import covariance_beside, poses_of_frames
+from nolbo_ppl.io.trajectories import covariance_beside, poses_of_frames, read_frame_poses
 from nolbo_ppl.odometry import (
     GroundHeight,
     KnownLengths,
@@ -38,7 +38,7 @@ class RunInputs:
     used: Int[np.ndarray, " u"]
     """Images that are looked at: every so many-th."""
     truth: Poses | None
-    """True pose of every image."""
+    """True pose of every image; NaN where it is not known."""
 
     @property
     def intrinsics(self) -> Float[np.ndarray, " 4"]:
@@ -98,7 +98,9 @@ def open_drive(config: RunConfig) -> RunInputs:
     """
     frames = open_frames(config.images)
     camera = read_camera(config.intrinsics, frames.size)
-    truth = None if config.truth is None else poses_of_frames(config.truth, len(frames), frames.times, of="the images")
+    truth = None
+    if config.truth is not None:
+        truth = read_frame_poses(config.truth, len(frames), frames.times, of="the images").T_world_camera
     return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth)
 
 
@@ -113,6 +115,8 @@ def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
     if config.wheel is not None:
         return KnownLengths(lengths_between(wheel_lengths(config.wheel, len(drive.frames) - 1), drive.used))
     if drive.truth is not None:
+        if not np.isfinite(drive.truth[drive.used]).all():
+            raise input_error("lengths from a truth with gaps", expected="a pose for every image, --wheel or --camera-height")
         return KnownLengths(lengths_of(drive.truth[drive.used]))
     raise input_error(
         "visual odometry without a scale",

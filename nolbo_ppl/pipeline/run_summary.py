@@ -90,7 +90,7 @@ def read_result(folder: Path) -> RunResult:
         azimuth_modes=tuple(row.get("azimuth_modes") for row in rows),
         odometry=odometry,
         estimate=read_trajectory(folder / "slam" / "trajectory.txt").T_world_camera,
-        truth=read_trajectory(truth).T_world_camera if truth.is_file() else None,
+        truth=read_trajectory(truth, lost=True).T_world_camera if truth.is_file() else None,
         covariance=covariance_beside(folder / "odometry.txt"),
         landmarks=landmarks,
         landmark_of=landmark_of,

@@ -42,7 +42,7 @@ def ways(run: RunFolder) -> dict[str, Float[np.ndarray, "n 4 4"]]:
 
 def near(way: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
     """Points within half the way's extent (at least 10 m) of its box: one far outlier must not shrink the whole picture."""
-    low, high = way.min(axis=0), way.max(axis=0)
+    low, high = np.nanmin(way, axis=0), np.nanmax(way, axis=0)  # a truth may have gaps
     reach = max(0.5 * float((high - low).max()), 10.0)
     return ((points >= low - reach) & (points <= high + reach)).all(axis=1)
 
@@ -195,8 +195,9 @@ def trajectory_errors(run: RunFolder) -> dict[str, tuple[Float[np.ndarray, " n"]
     for name in ("odometry", "estimate"):
         T = getattr(run, name)
         if T is not None and run.truth_given is not None:
-            moved = relative(run.truth_given, align(T, run.truth_given))
-            out[name] = np.linalg.norm(moved[:, :3, 3], axis=1), np.degrees(rotation_angle(moved[:, :3, :3]))
+            place = np.linalg.norm((align(T, run.truth_given) - run.truth_given)[:, :3, 3], axis=1)
+            turned = relative(run.truth_given, align(T, run.truth_given, "pose"))  # positions of a line do not tell its roll
+            out[name] = place, np.degrees(rotation_angle(turned[:, :3, :3]))
     return out
 
 

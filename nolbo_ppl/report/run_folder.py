@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import read_json, read_jsonl
-from nolbo_ppl.io.trajectories import poses_of_frames, read_trajectory
+from nolbo_ppl.io.trajectories import read_frame_poses, read_trajectory
 from nolbo_ppl.metrics.trajectory import align
 from nolbo_ppl.report.run_landmarks import RunAssociations, RunLandmark, read_associations, read_landmarks
 from nolbo_ppl.viz.map_plots import principal_plane
@@ -132,7 +132,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _rows(path: Path | None, count: int, times: np.ndarray | None, what: str) -> Poses | None:
     """Poses of an optional trajectory: rows of the estimate, or rows matched by time."""
-    return None if path is None else poses_of_frames(path, count, times, what=what, of="the estimate")
+    return None if path is None else read_frame_poses(path, count, times, what=what, of="the estimate").T_world_camera
 
 
 def _iterations(path: Path, count: int) -> Iterations | None:
@@ -248,7 +248,7 @@ def read_run(
         estimate=estimate,
         landmarks=landmarks,
         odometry=_rows(place(odometry, "odometry.txt"), count, times, "the odometry"),
-        truth=None if truth_given is None else align(truth_given, estimate),
+        truth=None if truth_given is None else align(truth_given, estimate, "pose"),
         truth_given=truth_given,
         times=times,
         images=images,

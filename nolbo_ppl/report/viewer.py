@@ -82,8 +82,9 @@ def wxyz(R: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
 
 
 def segments(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 2 3"]:
-    """A line through points as pieces; one point gives one piece of no length."""
+    """A line through points as pieces, straight across unknown ones (NaN); one point gives one piece of no length."""
     points = np.asarray(points, dtype=np.float32)
+    points = points[np.isfinite(points).all(axis=1)]
     return np.stack([points[:-1], points[1:]], axis=1) if len(points) > 1 else np.repeat(points[None], 2, axis=1)
 
 

@@ -79,7 +79,7 @@ def draw_slam_result(
         path,
         odometry,
         result.T_world_camera,
-        truth=None if truth is None else align(truth, result.T_world_camera),
+        truth=None if truth is None else align(truth, result.T_world_camera, "pose"),
         landmarks=np.array([x.T_world_object[:3, 3] for x in landmarks]).reshape(-1, 3),
         covariance=np.array([x.position_covariance for x in landmarks]).reshape(-1, 3, 3),
         names=[x.name for x in landmarks],

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import minimize
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.geometry.pose import chain, make_pose, se3_exp, so3_exp
+from nolbo_ppl.geometry.pose import chain, make_pose, rotation_angle, se3_exp, so3_exp
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align, path_length, relative_pose_error, umeyama
 
@@ -20,6 +20,40 @@ from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align, path_
 def walk(n: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return chain(np.eye(4), se3_exp(0.3 * rng.standard_normal((n - 1, 6)) + np.array([0, 0, 0, 0, 0, 1.0])))
+
+
+def test_unknown_rows_of_the_truth_are_left_out() -> None:
+    """The figures are those of the other rows alone."""
+    rng = np.random.default_rng(3)
+    truth = se3_exp(rng.standard_normal((9, 6)))
+    estimate = truth @ se3_exp(0.05 * rng.standard_normal((9, 6)))
+    gaps, known = truth.copy(), np.array([0, 1, 4, 5, 6, 8])
+    gaps[[2, 3, 7]] = np.nan
+    found, alone = absolute_trajectory_error(estimate, gaps), absolute_trajectory_error(estimate[known], truth[known])
+    np.testing.assert_allclose(found.errors, alone.errors, atol=1e-12)
+    steps = relative_pose_error(estimate, gaps)
+    pairs = [relative_pose_error(estimate[k : k + 2], truth[k : k + 2]).rmse for k in (0, 4, 5)]
+    np.testing.assert_allclose(steps.errors, pairs, atol=1e-12)
+    assert path_length(gaps) == pytest.approx(path_length(truth[known]))
+    half = truth.copy()
+    half[2, 0, 3] = np.nan
+    with pytest.raises(InputError, match="truth holds values that are not finite"):
+        absolute_trajectory_error(estimate, half)
+    with pytest.raises(InputError, match="no row with both"):
+        absolute_trajectory_error(estimate, np.full_like(truth, np.nan))
+
+
+def test_a_straight_road_is_aligned_by_what_the_cameras_see() -> None:
+    """Positions on a line leave the turn about it open: `pose` finds it, and leaves positions as well aligned as `se3`."""
+    rng = np.random.default_rng(0)
+    truth = np.tile(np.eye(4), (40, 1, 1))
+    truth[:, 2, 3] = np.arange(40) * 2.0
+    moved = se3_exp(np.array([0.3, -0.2, 1.4, 5.0, 1.0, -2.0])) @ truth
+    moved[:, :3, 3] += 0.01 * rng.standard_normal((40, 3))
+    aligned = align(moved, truth, "pose")
+    assert np.degrees(rotation_angle(np.swapaxes(truth, 1, 2)[:, :3, :3] @ aligned[:, :3, :3])).max() < 0.1
+    errors = [np.linalg.norm((align(moved, truth, kind) - truth)[:, :3, 3], axis=1) for kind in ("pose", "se3")]
+    assert np.sqrt(np.mean(errors[0] ** 2)) < 1.05 * np.sqrt(np.mean(errors[1] ** 2))
 
 
 def test_umeyama_recovers_a_similarity() -> None:

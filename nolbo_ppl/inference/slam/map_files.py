@@ -18,7 +18,7 @@ from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, write_voxels
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
-from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, relative_pose_error
+from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, known_rows, relative_pose_error
 from nolbo_ppl.structures.landmark import Landmark
 
 
@@ -88,9 +88,10 @@ def library_versions() -> dict[str, str]:
 
 
 def trajectory_errors(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """ATE (SE(3) aligned) and RPE over one row, as root mean squares."""
+    """ATE (SE(3) aligned) and RPE over one row, as root mean squares, over the rows whose truth is known (not NaN)."""
     out = {"ate": absolute_trajectory_error(estimate, truth).rmse}
-    if len(truth) > 1:
+    known = known_rows(truth)
+    if (known[1:] & known[:-1]).any():
         out["rpe_translation"] = relative_pose_error(estimate, truth).rmse
         out["rpe_rotation"] = relative_pose_error(estimate, truth, part="rotation").rmse
     return out
@@ -126,6 +127,7 @@ def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, An
         "configuration": {k: dict(v) if k == "category_symmetry" else v for k, v in asdict(state.config).items()},
     }
     if truth is not None:
+        out["frames_with_truth"] = int(known_rows(truth).sum())
         out["before"] = trajectory_errors(state.problem.odometry, truth)
         out["after"] = trajectory_errors(result.T_world_camera, truth)
     return out
