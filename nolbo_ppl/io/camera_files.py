@@ -1,18 +1,22 @@
-"""Intrinsics of a camera from files: our JSON, a KITTI calibration, or four numbers."""
+"""A camera from files: YAML and JSON of the calibration tools, a KITTI calibration, or numbers; its distortion, if any."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.distortion import COUNTS, DistortionModel, zoom_without_rims
+from nolbo_ppl.io.camera_documents import FORMATS, distortion_of, fields_of, load_yaml, unknown_fields
 from nolbo_ppl.io.files import read_json, write_json
-from nolbo_ppl.io.text import read_words
+from nolbo_ppl.io.text import read_lines, read_words
 
 NAMES = ("fx", "fy", "cx", "cy")
 KITTI_ROWS = ("P2", "P0", "P_rect_02", "P_rect_00")
@@ -21,7 +25,12 @@ KITTI_ROWS = ("P2", "P0", "P_rect_02", "P_rect_00")
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """A pinhole camera without distortion; the centre of the first pixel is at (0.5, 0.5)."""
+    """A pinhole camera, with what its lens distorts; the centre of the first pixel is at (0.5, 0.5).
+
+    Example:
+        >>> CameraIntrinsics(200.0, 200.0, 160.0, 120.0).is_distorted
+        False
+    """
 
     fx: float
     """Focal length along the rows, px."""
@@ -35,15 +44,32 @@ class CameraIntrinsics:
     """Width of the images it was stated for, px."""
     height: int | None = None
     """Their height, px."""
+    model: DistortionModel | None = None
+    """Model of the lens distortion; None without one."""
+    distortion: tuple[float, ...] = ()
+    """Its coefficients in OpenCV's order."""
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether the images have to be undistorted before straight lines are straight."""
+        return self.model is not None
+
+    def undistorted(self, size: tuple[int, int]) -> CameraIntrinsics:
+        """The pinhole camera of the undistorted images of this size; focal lengths grow where corners were not seen."""
+        if self.model is None:
+            return self
+        factor = zoom_without_rims(self.vector, size, self.model, self.distortion)
+        return CameraIntrinsics(factor * self.fx, factor * self.fy, self.cx, self.cy, *size)
 
     @property
     def vector(self) -> Float[np.ndarray, " 4"]:
         """[fx, fy, cx, cy] in px."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
-    def as_dict(self) -> dict[str, float | int | None]:
+    def as_dict(self) -> dict[str, Any]:
         """What `intrinsics.json` holds."""
-        return {name: getattr(self, name) for name in (*NAMES, "width", "height")}
+        plain = {name: getattr(self, name) for name in (*NAMES, "width", "height")}
+        return plain if self.model is None else plain | {"distortion_model": self.model, "distortion": list(self.distortion)}
 
 
 def checked(values: CameraIntrinsics, size: tuple[int, int] | None, file: Path, line: int | None) -> CameraIntrinsics:
@@ -88,16 +114,14 @@ def checked(values: CameraIntrinsics, size: tuple[int, int] | None, file: Path, 
             file=file,
             line=line,
         )
-    return CameraIntrinsics(values.fx, values.fy, values.cx, values.cy, width, height)
+    return replace(values, width=width, height=height)
 
 
-def _from_json(path: Path) -> CameraIntrinsics:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise input_error("not intrinsics", got=type(content).__name__, expected='{"fx", "fy", "cx", "cy", ...}', file=path)
-    values: dict[str, float | int | None] = {}
+def _from_fields(fields: Mapping[str, Any], path: Path) -> CameraIntrinsics:
+    """A camera of flat fields. Raises `InputError` naming the field."""
+    values: dict[str, Any] = {}
     for name in (*NAMES, "width", "height"):
-        value = content.get(name)
+        value = fields.get(name)
         missing = value is None and name in NAMES
         if missing or isinstance(value, bool) or not isinstance(value, int | float | None):
             raise input_error(
@@ -106,10 +130,30 @@ def _from_json(path: Path) -> CameraIntrinsics:
         values[name] = value
     for name in ("width", "height"):
         value = values[name]
-        if value is not None and (value != int(value) or value <= 0):
+        if value is not None and not (0 < value < 1e6 and value == int(value)):
             raise input_error(f"intrinsics: {name}", got=value, expected="a whole number of pixels", file=path)
         values[name] = None if value is None else int(value)
-    return CameraIntrinsics(**values)  # type: ignore[arg-type]
+    values["model"], values["distortion"] = distortion_of(fields, path)
+    return CameraIntrinsics(**values)
+
+
+def _from_json(path: Path) -> CameraIntrinsics:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise input_error("not intrinsics", got=type(content).__name__, expected='{"fx", "fy", "cx", "cy", ...}', file=path)
+    strange = unknown_fields(content)
+    if strange:
+        raise input_error(
+            "unknown fields of a camera",
+            got=", ".join(strange),
+            expected="fx, fy, cx, cy, width, height, distortion, distortion_model, or k1 k2 p1 p2 k3",
+            do="what is not understood may be what the images need",
+            file=path,
+        )
+    if not any(name in content for name in NAMES) and len(content) > 0:
+        return _from_fields(fields_of(content, path), path)
+    extra = fields_of({**dict.fromkeys(NAMES, 0.0), **content}, path)
+    return _from_fields({**extra, **{name: content.get(name) for name in NAMES}}, path)
 
 
 def _from_text(path: Path) -> tuple[CameraIntrinsics, int]:
@@ -132,22 +176,30 @@ def _from_text(path: Path) -> tuple[CameraIntrinsics, int]:
                     raise input_error(f"{label} is no projection of a rectified camera", file=path, line=number)
                 return CameraIntrinsics(values[0], values[5], values[2], values[6]), number
         raise input_error(
-            "no known row of a KITTI calibration", got=", ".join(labelled), expected="one of " + ", ".join(KITTI_ROWS), file=path
+            "no known row of a KITTI calibration",
+            got=", ".join(labelled),
+            expected="one of " + ", ".join(KITTI_ROWS),
+            do=f"read are: {FORMATS}",
+            file=path,
         )
     flat = [value for number, words in rows for value in _numbers(words, path, number)]
-    if len(flat) == 9 and flat[3] == flat[6] == flat[7] == 0 and flat[8] == 1:
-        flat = [flat[0], flat[4], flat[2], flat[5]]  # a camera matrix
-    if len(flat) != 4:
+    rest: list[float] = []
+    if len(flat) >= 9 and flat[3] == flat[6] == flat[7] == 0 and flat[8] == 1:  # a camera matrix
+        if flat[1]:
+            raise input_error("camera matrix with skew", got=flat[1], expected="0", file=path, line=rows[0][0])
+        flat, rest = [flat[0], flat[4], flat[2], flat[5]], flat[9:]
+    elif len(flat) > 4:
+        flat, rest = flat[:4], flat[4:]
+    if len(flat) != 4 or len(rest) not in (0, *COUNTS["radial-tangential"], *COUNTS["rational"]):
         raise input_error(
             "intrinsics",
-            got=f"{len(flat)} numbers",
-            expected="fx fy cx cy",
-            do="images must be undistorted",
+            got=f"{len(flat) + len(rest)} numbers",
+            expected="fx fy cx cy, or after them the distortion k1 k2 p1 p2 [k3 [k4 k5 k6]]",
             file=path,
             line=rows[0][0],
         )
-    fx, fy, cx, cy = flat
-    return CameraIntrinsics(fx, fy, cx, cy), rows[0][0]
+    model, distortion = distortion_of({"distortion": rest}, path)
+    return CameraIntrinsics(*flat, model=model, distortion=distortion), rows[0][0]  # type: ignore[arg-type]
 
 
 def _numbers(words: list[str], path: Path, line: int) -> list[float]:
@@ -158,12 +210,28 @@ def _numbers(words: list[str], path: Path, line: int) -> list[float]:
 
 
 def read_intrinsics(path: str | PathLike[str], size: tuple[int, int] | None = None) -> Float[np.ndarray, " 4"]:
-    """[fx, fy, cx, cy] in px of a file that `read_camera` reads. Raises `InputError` naming file and line."""
-    return read_camera(path, size).vector
+    """[fx, fy, cx, cy] in px of a file that `read_camera` reads, of a camera without distortion.
+
+    Raises:
+        InputError: as there, or a distortion, which four numbers cannot hold; names file and line.
+    """
+    camera = read_camera(path, size)
+    if camera.is_distorted:
+        raise input_error(
+            "camera with distortion",
+            got=f"{camera.model} {list(camera.distortion)}",
+            expected="images that were undistorted, and their intrinsics",
+            do="read_camera keeps the distortion; data.sequences.undistorted applies it",
+            file=path,
+        )
+    return camera.vector
 
 
 def read_camera(path: str | PathLike[str], size: tuple[int, int] | None = None) -> CameraIntrinsics:
-    """Read intrinsics: JSON with fx, fy, cx, cy (and width, height), a KITTI calibration (P2, else P0), or four numbers.
+    """Read a camera: YAML of OpenCV, ROS (`camera_info`), Kalibr, EuRoC, ORB-SLAM, OpenVSLAM or VINS; JSON with fx, fy, cx, cy
+    (and width, height, distortion); a KITTI calibration (P2, else P0); or numbers, fx fy cx cy and the distortion.
+
+    A distortion that is given is kept (`is_distorted`), one of zeros is none. Unknown fields of JSON are refused.
 
     Values are taken as they stand; calibrations that place the first pixel's centre at (0, 0), as OpenCV's do, are half
     a pixel off in cx and cy.
@@ -178,6 +246,8 @@ def read_camera(path: str | PathLike[str], size: tuple[int, int] | None = None) 
     path = Path(path)
     if path.suffix.lower() == ".json":
         return checked(_from_json(path), size, path, None)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return checked(_from_fields(fields_of(load_yaml(path, read_lines(path)), path), path), size, path, None)
     values, line = _from_text(path)
     return checked(values, size, path, line)
 

@@ -1,0 +1,150 @@
+"""Lens distortion: where a camera sees a point, and what its images, points and boxes are without it.
+
+Models and order of the coefficients are OpenCV's: `radial-tangential` k1 k2 p1 p2 [k3], `rational` k1 k2 p1 p2 k3 k4 k5 k6
+(with thin-prism and tilt terms: 12 or 14), `fisheye` k1 k2 k3 k4 (equidistant, Kannala and Brandt 2006).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from nolbo_ppl.errors import input_error
+
+DistortionModel = Literal["radial-tangential", "rational", "fisheye"]
+COUNTS: dict[str, tuple[int, ...]] = {"radial-tangential": (4, 5), "rational": (8, 12, 14), "fisheye": (4,)}
+"""Coefficients of each model."""
+EDGE_POINTS = 9
+"""Points along each edge of a box that are undistorted: its edges become curves."""
+ITERATIONS = (2, 100, 1e-12)
+"""Inversion by fixed point (OpenCV's criteria: count and accuracy together)."""
+
+
+def _camera(intrinsics: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def distort_points(
+    points: Float[np.ndarray, "n 2"], intrinsics: Float[np.ndarray, " 4"], model: DistortionModel, coefficients: tuple[float, ...]
+) -> Float[np.ndarray, "n 2"]:
+    """Where the lens shows what an ideal pinhole camera of the same intrinsics would show at these pixels."""
+    import cv2
+
+    slopes = (np.asarray(points, dtype=np.float64) - intrinsics[2:]) / intrinsics[:2]
+    d = np.array(coefficients)
+    if model == "fisheye":
+        return cv2.fisheye.distortPoints(slopes[:, None], _camera(intrinsics), d)[:, 0]
+    rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), _camera(intrinsics), d)[0][:, 0]
+
+
+def undistort_points(
+    points: Float[np.ndarray, "n 2"], intrinsics: Float[np.ndarray, " 4"], model: DistortionModel, coefficients: tuple[float, ...]
+) -> Float[np.ndarray, "n 2"]:
+    """Where an ideal pinhole camera of the same intrinsics shows what the lens shows at these pixels.
+
+    Raises:
+        InputError: a pixel beyond what the model can undo (outside the image of a strong lens).
+
+    Example:
+        >>> camera = np.array([200.0, 200.0, 160.0, 120.0])
+        >>> seen = distort_points(np.array([[20.0, 20.0]]), camera, "radial-tangential", (-0.28, 0.07, 0.0, 0.0))
+        >>> undistort_points(seen, camera, "radial-tangential", (-0.28, 0.07, 0.0, 0.0)).round(3).tolist()
+        [[20.0, 20.0]]
+    """
+    import cv2
+
+    points = np.asarray(points, dtype=np.float64)
+    if not len(points):
+        return points.reshape(0, 2)
+    K, d = _camera(intrinsics), np.array(coefficients)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, ITERATIONS[1], ITERATIONS[2])
+    if model == "fisheye":
+        found = cv2.fisheye.undistortPoints(points[:, None], K, d, P=K, criteria=criteria)[:, 0]
+    else:
+        found = cv2.undistortPointsIter(points[:, None], K, d, np.eye(3), K, criteria)[:, 0]
+    back = distort_points(found, intrinsics, model, coefficients) if np.isfinite(found).all() else np.full_like(points, np.inf)
+    if not np.abs(back - points).max() < 0.1:
+        worst = points[int(np.argmax(np.abs(back - points).max(axis=1)))]
+        raise input_error(
+            "pixel that the distortion model cannot undo",
+            got=np.round(worst, 1).tolist(),
+            expected="pixels of the image, a calibration that covers it",
+        )
+    return found
+
+
+def undistort_boxes(
+    boxes: Float[np.ndarray, "n 4"], intrinsics: Float[np.ndarray, " 4"], model: DistortionModel, coefficients: tuple[float, ...]
+) -> Float[np.ndarray, "n 4"]:
+    """Boxes [x0, y0, x1, y1] around the undistorted edges of boxes."""
+    boxes = np.asarray(boxes, dtype=np.float64).reshape(-1, 4)
+    if not len(boxes):
+        return boxes
+    along = np.linspace(0, 1, EDGE_POINTS)
+    unit = np.concatenate([np.stack([along, np.full_like(along, s)], 1)[:, order] for s in (0, 1) for order in ([0, 1], [1, 0])])
+    points = boxes[:, None, :2] + unit * (boxes[:, None, 2:] - boxes[:, None, :2])
+    found = undistort_points(points.reshape(-1, 2), intrinsics, model, coefficients).reshape(len(boxes), -1, 2)
+    return np.concatenate([found.min(axis=1), found.max(axis=1)], axis=1)
+
+
+def zoom_without_rims(
+    intrinsics: Float[np.ndarray, " 4"], size: tuple[int, int], model: DistortionModel, coefficients: tuple[float, ...]
+) -> float:
+    """Least factor (at least 1) on the focal lengths with which every pixel of the undistorted image was seen.
+
+    At a factor of 1 the lens may not have seen the corners (pincushion distortion); pixels without a picture would be
+    corners and edges to whatever looks at the image.
+    """
+    width, height = size
+    across, up = np.linspace(0.5, width - 0.5, 33), np.linspace(0.5, height - 0.5, 33)
+    rim = np.concatenate(
+        [np.stack([across, np.full(33, v)], 1) for v in (0.5, height - 0.5)]
+        + [np.stack([np.full(33, u), up], 1) for u in (0.5, width - 0.5)]
+    )
+
+    def seen(factor: float) -> bool:
+        inner = intrinsics[2:] + (rim - intrinsics[2:]) / factor
+        at = distort_points(inner, intrinsics, model, coefficients)
+        return bool(((at >= 0) & (at <= [width, height])).all())
+
+    if seen(1.0):
+        return 1.0
+    low, high = 1.0, 2.0
+    if not seen(high):
+        return 1.0  # no zoom mends a calibration of other images; the rims stay black
+    for _ in range(20):
+        middle = (low + high) / 2
+        low, high = (low, middle) if seen(middle) else (middle, high)
+    return high
+
+
+@lru_cache(maxsize=4)
+def _maps(
+    intrinsics: tuple[float, ...], target: tuple[float, ...], size: tuple[int, int], model: str, coefficients: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    import cv2
+
+    K, new, d = _camera(np.array(intrinsics)), _camera(np.array(target)), np.array(coefficients)
+    make = cv2.fisheye.initUndistortRectifyMap if model == "fisheye" else cv2.initUndistortRectifyMap
+    return make(K, d, np.eye(3), new, size, cv2.CV_32FC1)
+
+
+def undistort_image(
+    image: UInt8[np.ndarray, "h w 3"],
+    intrinsics: Float[np.ndarray, " 4"],
+    model: DistortionModel,
+    coefficients: tuple[float, ...],
+    target: Float[np.ndarray, " 4"] | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The image of a pinhole camera, of the same intrinsics or of `target`, bilinearly; black where the lens saw nothing."""
+    import cv2
+
+    size = (image.shape[1], image.shape[0])
+    new = intrinsics if target is None else target
+    maps = _maps(tuple(intrinsics.tolist()), tuple(new.tolist()), size, model, tuple(coefficients))
+    return cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR)
