@@ -13,13 +13,13 @@ from typing import Any
 import yaml
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.distortion import COUNTS
+from nolbo_ppl.geometry.distortion import COUNTS, DistortionModel
 
 FORMATS = (
     "YAML of OpenCV, ROS, Kalibr, EuRoC or ORB-SLAM; JSON with fx, fy, cx, cy; a KITTI calibration; or the numbers fx fy cx cy"
 )
 """What is read, for messages."""
-MODELS = {
+MODELS: dict[str, DistortionModel | None] = {
     "": None,
     "none": None,
     "pinhole": None,
@@ -195,7 +195,7 @@ def unknown_fields(content: Mapping[str, Any]) -> list[str]:
     return sorted(str(key) for key in content if str(key).lower() not in known and not _SILENT.fullmatch(str(key).lower()))
 
 
-def distortion_of(fields: Mapping[str, Any], path: Path) -> tuple[str | None, tuple[float, ...]]:
+def distortion_of(fields: Mapping[str, Any], path: Path) -> tuple[DistortionModel | None, tuple[float, ...]]:
     """Model and coefficients; None and nothing where there is no distortion.
 
     Raises:

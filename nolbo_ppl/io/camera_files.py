@@ -133,7 +133,7 @@ def _from_fields(fields: Mapping[str, Any], path: Path) -> CameraIntrinsics:
         if value is not None and not (0 < value < 1e6 and value == int(value)):
             raise input_error(f"intrinsics: {name}", got=value, expected="a whole number of pixels", file=path)
         values[name] = None if value is None else int(value)
-    values["model"], values["distortion"] = distortion_of(fields, path)
+    values |= dict(zip(("model", "distortion"), distortion_of(fields, path)))
     return CameraIntrinsics(**values)
 
 
@@ -199,7 +199,8 @@ def _from_text(path: Path) -> tuple[CameraIntrinsics, int]:
             line=rows[0][0],
         )
     model, distortion = distortion_of({"distortion": rest}, path)
-    return CameraIntrinsics(*flat, model=model, distortion=distortion), rows[0][0]  # type: ignore[arg-type]
+    fx, fy, cx, cy = flat
+    return CameraIntrinsics(fx, fy, cx, cy, None, None, model, distortion), rows[0][0]
 
 
 def _numbers(words: list[str], path: Path, line: int) -> list[float]:

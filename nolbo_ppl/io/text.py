@@ -14,7 +14,5 @@ def read_lines(path: Path) -> list[str]:
 
 def read_words(path: Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of a text file without comments and blank lines. Raises `InputError` when it is none."""
-    split = [
-        (number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in enumerate(read_lines(path), start=1)
-    ]
+    split = [(number, line.split("#", 1)[0].replace(",", " ").split()) for number, line in enumerate(read_lines(path), start=1)]
     return [(number, words) for number, words in split if words]

@@ -20,6 +20,8 @@ frame or time; `tum` time, position, quaternion x y z w; `euroc` time in ns, pos
 EXPECTED = "12 (KITTI), 16 (4 x 4) or 8 (TUM, EuRoC)"
 MOST_FRAMES = 10_000_000
 """Whole numbers below count frames; from there on they are times in ns, µs or ms."""
+FARTHEST = 1e9
+"""Largest coordinate, m: beyond, squares of distances lose what is asked for, and singular values do not converge."""
 _UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Times above are no seconds: 1e11 s after 1970 is the year 5138."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
@@ -203,6 +205,10 @@ def _check_lost(path: Path, rows: np.ndarray, lines: np.ndarray, lost: bool) -> 
             file=path,
             line=int(lines[k]),
         )
+    far = np.abs(np.where(finite, rows, 0.0)).max(axis=1) > FARTHEST
+    if far.any():
+        k = int(np.argmax(far))
+        raise input_error("a value is out of range", expected=f"within {FARTHEST:g}", file=path, line=int(lines[k]))
     return finite.all(axis=1)
 
 
@@ -253,7 +259,9 @@ def parse_table(path: Path, lines: Sequence[str], form: TableFormat | None = Non
         named = columns_of(rows.header, width) if form is None else None
         order = named[0] if named is not None else [0, 1, 2, 3, 5, 6, 7, 4] if found == "euroc" else list(range(8))
         table, at = rows.table[:, order], rows.lines
-        _check_lost(path, table[:, :1], at, False)
+        if not np.isfinite(table[:, 0]).all():
+            line = int(at[int(np.argmin(np.isfinite(table[:, 0])))])
+            raise input_error("a time is not finite", file=path, line=line)
         times = _seconds(table[:, 0], rows.header if named is not None or "[" in rows.header else "")
         known = _check_lost(path, table[:, 1:], at, lost)
         table = np.where(known[:, None], table, [0, 0, 0, 0, 0, 0, 0, 1])

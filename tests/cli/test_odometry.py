@@ -87,7 +87,7 @@ def test_truth_by_time(drive: Path, tmp_path: Path) -> None:
     main(arguments(drive, tmp_path, "--scale", "truth", "--truth", tmp_path / "longer.txt"))
     assert (tmp_path / "times.txt").read_text().split()[0] == "5.0"
     write_trajectory(tmp_path / "late.txt", Trajectory(longer.T_world_camera, longer.times + 50.0, "tum"))  # type: ignore[operator]
-    with pytest.raises(InputError, match="truth lacks times of the frames: got 0 of 6"):
+    with pytest.raises(InputError, match="truth has no time of the frames"):
         main(arguments(drive, tmp_path, "--scale", "truth", "--truth", tmp_path / "late.txt"))
     (drive / "times.txt").unlink()
 

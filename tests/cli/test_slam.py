@@ -125,7 +125,7 @@ def test_covariances_of_odometry_steps(folder: Path, tmp_path: Path, capsys: pyt
         ),
         ("observations", '{"frame": 0, "position": [0, 0', ":1: not a line of JSON"),
         ("odometry", "1 2 3\n", "unknown trajectory format"),
-        ("truth", "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "truth lacks times"),
+        ("truth", "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "truth has no time of the odometry"),
     ],
 )
 def test_errors_go_to_stderr_and_nothing_is_written(
