@@ -57,6 +57,8 @@ class ObservationFactors:
     """Covariance [rotation, position] in the measured landmark's frame, rad^2 and m^2."""
     weight: Float[np.ndarray, " k"]
     """Frozen weight."""
+    index: Int[np.ndarray, " k"]
+    """Detection each is of (a place in the rows they were made from)."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def resolve_observations(
     S = widened(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor)
     covariance[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ S @ R
     share = np.concatenate([np.ones(len(plain)), modes.responsibility])
-    return ObservationFactors(frame[k], landmark[k], make_pose(R, seen.position[k]), covariance, weight[k] * share)
+    return ObservationFactors(frame[k], landmark[k], make_pose(R, seen.position[k]), covariance, weight[k] * share, k)
 
 
 def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.NonlinearFactorGraph:
@@ -263,12 +265,22 @@ class Linearisation:
     """Whitened Jacobian."""
     factor: scipy.sparse.linalg.SuperLU
     """Factorisation of its normal matrix."""
+    residual: np.ndarray
+    """Whitened residuals at the point of linearisation, one a row of the Jacobian."""
 
     def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
         """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""
         noise = rng.standard_normal((self.jacobian.shape[0], count))
         delta = self.factor.solve(self.jacobian.T @ noise).reshape(-1, 6, count)
         return delta[self.landmarks :], delta[: self.landmarks]
+
+    def residual_samples(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "r s"]:
+        """Whitened residuals that the model itself expects after the fit: `e - J (J'J)^-1 J' e` for e of N(0, I).
+
+        Their mean square is one less the row's leverage; it is sampled without cancellation where a fit takes nearly all away.
+        """
+        noise = rng.standard_normal((self.jacobian.shape[0], count))
+        return noise - self.jacobian @ self.factor.solve(self.jacobian.T @ noise)
 
     def covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 6"]:
         """Marginal covariances of the given blocks (landmark j: j; pose i: landmarks + i)."""
@@ -300,7 +312,10 @@ def linearise(graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate) -> Line
     except RuntimeError as error:
         raise named_error(error) from None
     size = 6 * (len(estimate.T_world_camera) + len(estimate.T_world_landmark))
-    jacobian = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))[:, :size]
+    system = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))
+    jacobian = system[:, :size]
+    # The last column is the right-hand side; GTSAM leaves it out where all residuals are zero.
+    residual = -system[:, size].toarray().ravel() if system.shape[1] > size else np.zeros(system.shape[0])
     normal = (jacobian.T @ jacobian).tocsc()
     try:
         factor = scipy.sparse.linalg.splu(
@@ -308,4 +323,4 @@ def linearise(graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate) -> Line
         )
     except RuntimeError as error:
         raise GraphError(f"the linearised graph is indeterminate: {error}") from None
-    return Linearisation(len(estimate.T_world_landmark), len(estimate.T_world_camera), jacobian, factor)
+    return Linearisation(len(estimate.T_world_landmark), len(estimate.T_world_camera), jacobian, factor, residual)

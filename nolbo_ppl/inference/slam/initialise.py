@@ -199,8 +199,7 @@ def init_from_tracklets(
     for repeat in range(3):
         estimate, _, error = optimise(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
         state = replace(state, estimate=estimate, graph_error=error)
-        if repeat == 0:
-            state = calibrate(state)
+        state = replace(calibrate(state) if repeat < 2 else state)
         state = replace(state, weight=inlier_weights(state))
         if repeat == 0:
             state = odometry_by_evidence(state)

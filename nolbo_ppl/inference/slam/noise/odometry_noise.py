@@ -1,4 +1,4 @@
-"""Scales of the odometry: by the evidence of the tracked objects first, by the residuals over the posterior later."""
+"""Scales of the odometry: by the evidence of the tracked objects first, by that of the closed loops later."""
 
 from __future__ import annotations
 
@@ -6,33 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from nolbo_ppl.geometry.pose import adjoint, inverse, se3_log
-from nolbo_ppl.inference.slam.graph import (
-    Linearisation,
-    SlamEstimate,
-    add_landmark_priors,
-    add_observation_factors,
-    linearise,
-    odometry_factors,
-    optimise,
-    resolve_observations,
-)
-from nolbo_ppl.inference.slam.noise.noise_estimation import TOO_SMALL
+from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
+from nolbo_ppl.inference.slam.noise.fitted_residuals import squared_ratio
+from nolbo_ppl.inference.slam.noise.noise_estimation import SURE_GAIN, TOO_SMALL
+from nolbo_ppl.inference.slam.noise.scale_evidence import scale_evidence, scale_posterior
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 WINDOW = 200
 """Frames the evidence is taken from: where most detections are."""
-ROBUST_WIDTH = 2.0
-"""Width of the Cauchy kernel on detections in the evidence: a few wrong ones in tracks would pass for drift."""
-LEAST_GAIN = 3.0
-"""Log evidence, in nats, that another scale must gain."""
-STEPS = (4.0, 2.0)
-"""Factors tried on each scale, coarse first."""
-LEAST_FACTOR = 0.5
-"""Scales nobody stated are never taken below this part of the defaults: drift that is a bias shows only over loops."""
-LARGEST_FACTOR = 64.0
-"""And never beyond this multiple."""
+GRID = np.log(4.0) * np.arange(-3, 4)
+"""Log factors tried on scales nobody stated: 1/64 to 64 times the default."""
+STATED_GRID = np.log(4.0) * np.arange(0, 11)
+"""The same for stated ones, which are only ever raised: a covariance of 1e-12 is a scale 4 000 times too small."""
+LEAST_TOLD = 10.0
+"""Steps' worth of information below which residuals over the posterior change no scale."""
+LARGEST_CHANGE = 4.0
+"""Largest factor on a scale in one update."""
+FLAT = float(np.log(3.0))
+"""A scale whose log is known no better than this is called a guess."""
+BIAS_SURE = 4.0
+"""A bias is taken off when it is this many standard deviations from none."""
 
 
 def stated_scales(problem: SlamProblem, config: SlamConfig) -> tuple[bool, bool]:
@@ -81,114 +75,87 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
     )
 
 
-def log_evidence(window: SlamState, rotation: float, translation: float) -> float:
-    """Laplace log evidence of the window with odometry scales times the given factors, up to a constant, nats.
-
-    Detections have heavy tails here.
-    """
-    noise = replace(
-        window.noise,
-        rotation_step=window.noise.rotation_step * rotation,
-        translation_step=window.noise.translation_step * translation,
-    )
-    graph = odometry_factors(window.problem, noise)
-    factors = resolve_observations(
-        window.measurements,
-        window.problem.odometry,
-        noise,
-        window.config,
-        window.estimate,
-        window.rows,
-        window.landmark,
-        window.weight,
-    )
-    add_observation_factors(graph, factors, robust_width=ROBUST_WIDTH)
-    add_landmark_priors(graph, window.estimate.T_world_landmark, window.typical_range)
-    estimate, _, error = optimise(graph, window.estimate, iterations=10)
-    determinant = linearise(graph, estimate).log_determinant()
-    steps = len(noise.rotation_step)
-    return -error - 0.5 * determinant - 3 * steps * (np.log(rotation) + np.log(translation))
-
-
 def odometry_by_evidence(state: SlamState) -> SlamState:
-    """Scale factors of the odometry (where not stated) that the tracked objects make most probable, by coordinate search."""
-    stated_rotation, stated_translation = stated_scales(state.problem, state.config)
-    free = [not stated_rotation, not stated_translation]
-    window = densest_window(state) if any(free) else state
-    if not any(free) or len(window.rows) < 20 or len(window.problem) < 10:
+    """Scales of the odometry that the tracked objects make probable, where nobody stated them; a stated one that is too small.
+
+    Before loops close the evidence often bounds a scale from above alone. The one in use is then a standard deviation above
+    the posterior's mean: too wide a drift is annealed away as loops close, too narrow a one closes none.
+    """
+    free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
+    window = densest_window(state)
+    if len(window.rows) < 20 or len(window.problem) < 10:
         return state
+    report, warnings = dict(state.noise.report), list(state.noise.warnings)
+    evidence = scale_evidence(window)
     factors = np.ones(2)
-    best = log_evidence(window, *factors)
-    for step in STEPS:
-        improved = True
-        while improved:
-            improved = False
-            for axis in (0, 1):
-                for direction in (step, 1.0 / step):
-                    trial = factors.copy()
-                    trial[axis] *= direction
-                    if not free[axis] or not LEAST_FACTOR <= trial[axis] <= LARGEST_FACTOR:
-                        continue
-                    value = log_evidence(window, *trial)
-                    if value > best + LEAST_GAIN:
-                        factors, best, improved = trial, value, True
-                        break
-    report = dict(state.noise.report)
+    if any(free):
+        found = scale_posterior(evidence, free, grid=GRID)
+        factors = np.exp(found.mean + found.deviation)
+        for name, spread, is_free in zip(("rotation", "translation"), found.deviation, free):
+            if is_free:
+                report[f"odometry_{name}_log_spread"] = float(spread)
+    if not all(free):
+        stated = (not free[0], not free[1])
+        found = scale_posterior(evidence, stated, grid=STATED_GRID, width=1e3)
+        for axis, name in enumerate(("rotation", "translation")):
+            ratio = float(np.exp(found.mean[axis]))
+            if stated[axis] and ratio > TOO_SMALL and found.over_one > SURE_GAIN:
+                warnings.append(f"stated odometry {name} scale is too small: the evidence favours {ratio:.3g} times as much")
+                factors[axis] = ratio if state.config.correct_scales else 1.0
+    return _scaled(state, factors, report, warnings)
+
+
+def _scaled(state: SlamState, factors: np.ndarray, report: dict[str, float], warnings: list[str]) -> SlamState:
     noise = replace(
         state.noise,
         rotation_step=state.noise.rotation_step * factors[0],
         translation_step=state.noise.translation_step * factors[1],
         report=report,
+        warnings=tuple(dict.fromkeys(warnings)),
     )
     report["odometry_rotation_scale"] = float(np.median(noise.rotation_step))
     report["odometry_translation_scale"] = float(np.median(noise.translation_step))
     return replace(state, noise=noise)
 
 
-def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[float, float]:
-    """Root mean square of odometry residuals over the posterior, in units of their scales: rotation, translation.
+def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Squared ratio of the odometry's residuals to what the model expects after the fit, and how many steps tell it.
 
-    The expectation is over samples of the linearised graph: `r = r0 + d_i+1 - Ad d_i`.
+    For rotation and translation. The odometry's rows follow the six of the first pose's prior.
     """
     rng = np.random.default_rng(state.config.seed + 7919)
-    delta, _ = linearisation.samples(min(state.config.samples, 24), rng)
-    T = state.estimate.T_world_camera
-    step = inverse(T[:-1]) @ T[1:]
-    measured = inverse(state.problem.odometry[:-1]) @ state.problem.odometry[1:]
-    mean = se3_log(inverse(measured) @ step)
-    square = mean**2 + np.mean((delta[1:] - adjoint(inverse(step)) @ delta[:-1]) ** 2, axis=2)
-    rotation = np.sqrt(np.mean(square[:, :3] / state.noise.rotation_step[:, None] ** 2))
-    translation = np.sqrt(np.mean(square[:, 3:] / state.noise.translation_step[:, None] ** 2))
-    return float(rotation), float(translation)
+    end = 6 * len(state.problem)
+    expected = linearisation.residual_samples(min(state.config.samples, 24), rng)[6:end].reshape(
+        -1, 6, min(state.config.samples, 24)
+    )
+    residual = linearisation.residual[6:end].reshape(-1, 6)
+    out = []
+    for part in (slice(3), slice(3, 6)):
+        out.append(squared_ratio(residual[:, part].ravel(), expected[:, part].reshape(-1, expected.shape[2])))
+    return out[0], out[1]
 
 
 def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState:
-    """One EM update of the odometry scales: `sigma^2 <- E[r^2]` over the posterior.
+    """One update of the odometry's scales to the fixed point of the evidence: `sigma^2 <- sigma^2 sum r^2 / sum E[r^2]`.
 
-    Stated scales stay unless they are too small by more than a third (reported, and raised with `correct_scales`);
-    scales nobody stated only grow: a posterior that knows little of a step would let them creep.
+    Scales nobody stated go up and down where `LEAST_TOLD` steps tell them. Stated ones stay unless they are too small by more
+    than a third (reported, and raised with `correct_scales`).
     """
     if len(state.problem) < 3 or not len(state.rows):
         return state
-    factors = []
     report, warnings = dict(state.noise.report), list(state.noise.warnings)
+    factors = np.ones(2)
     ratios = residual_ratios(state, linearisation)
-    for name, stated, ratio in zip(("rotation", "translation"), stated_scales(state.problem, state.config), ratios):
-        factor = max(ratio, 1.0)
-        if stated:
-            factor = 1.0
-            if ratio > TOO_SMALL:
-                text = f"stated odometry {name} scale is too small: residuals are {ratio:.2f} times as wide"
-                warnings = [w for w in warnings if not w.startswith(f"stated odometry {name}")] + [text]
-                factor = ratio if state.config.correct_scales else 1.0
-        factors.append(factor)
-    noise = replace(
-        state.noise,
-        rotation_step=state.noise.rotation_step * factors[0],
-        translation_step=state.noise.translation_step * factors[1],
-        report=report,
-        warnings=tuple(warnings),
-    )
-    report["odometry_rotation_scale"] = float(np.median(noise.rotation_step))
-    report["odometry_translation_scale"] = float(np.median(noise.translation_step))
-    return replace(state, noise=noise)
+    for axis, name in enumerate(("rotation", "translation")):
+        squared, told = ratios[axis]
+        report[f"odometry_{name}_told"] = told
+        if told < LEAST_TOLD:
+            continue
+        ratio = float(np.clip(np.sqrt(squared), 1 / LARGEST_CHANGE, LARGEST_CHANGE))
+        if not stated_scales(state.problem, state.config)[axis]:
+            factors[axis] = ratio
+        elif ratio > TOO_SMALL:
+            text = f"stated odometry {name} scale is too small: residuals are {ratio:.2f} times as wide"
+            warnings = [w for w in warnings if not w.startswith(f"stated odometry {name}")] + [text]
+            factors[axis] = ratio if state.config.correct_scales else 1.0
+    return _scaled(state, factors, report, warnings)

@@ -1,9 +1,9 @@
-"""Scales against whole tracks: how wide residuals are, and how much one resembles the next.
+"""Scales of detections against whole tracks: how wide residuals are, and how much one resembles the next.
 
-Differences of consecutive detections (`noise`) understate errors that change slowly, as those of real detectors do: one
-view of an object gives one error, not thirty. Residuals about the solved tracks show them. Their width corrects the
-scale; their correlation from one detection to the next says how many independent ones there are, and the graph divides
-the information by that number.
+Gaps between frames (`noise_estimation`) understate errors that change slowly, as those of real detectors do: one view of an
+object gives one error, not thirty. Residuals about the solved tracks show them, compared with what the graph itself expects
+after the fit. The width of single ones corrects the scale; the width of their sums over halves of tracks says how many
+detections are worth one independent one, and the graph divides the information by that number.
 """
 
 from __future__ import annotations
@@ -13,120 +13,120 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import inverse, relative, so3_log, transform
-from nolbo_ppl.inference.slam.noise.noise_estimation import TOO_SMALL, robust_scale
-from nolbo_ppl.inference.slam.orientation import nearest_of_modes
+from nolbo_ppl.inference.slam.noise.fitted_residuals import block_ratio, fitted_residuals, halves_of_tracks, robust_width
+from nolbo_ppl.inference.slam.noise.noise_estimation import LEAST_RANGE_PART, TOO_SMALL
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
-CLIP = 3.0
-"""Whitened residuals are clipped here before they are correlated."""
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
+LEAST_FACTOR = 0.05
+"""Least factor on a scale nobody stated."""
 UNSTATED_FACTOR, UNSTATED_ROTATION_FACTOR = 4.0, 16.0
-"""Least factors where nobody stated a scale: detectors are biased by view, most of all in orientation, which residuals about
-one track do not show."""
+"""What correlated errors are expected to cost where nobody stated a scale: detectors are biased by view, most of all in
+orientation. A prior: it counts as `PRIOR_BLOCKS` halves of tracks do."""
+PRIOR_BLOCKS = 8.0
+"""Weight of this prior, in halves of tracks."""
 POOR_DEPTH = 1.5
 """Depth this many times as noisy as directions is that of a camera: then it is biased as well, and its factor grows."""
 LEAST_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
 
-def correlation_factor(whitened: Float[np.ndarray, "k c"], track: Int[np.ndarray, " k"], frame: Int[np.ndarray, " k"]) -> float:
-    """Factor on covariances that makes up for correlated errors: `(1 + r) / (1 - r)` of a first-order process, at least 1."""
-    order = np.lexsort((frame, track))
-    z = np.clip(whitened[order], -CLIP, CLIP)
-    follows = (np.diff(track[order]) == 0) & (np.diff(frame[order]) <= 2)
-    if follows.sum() < LEAST_DETECTIONS:
-        return 1.0
-    product, square = z[:-1][follows] * z[1:][follows], 0.5 * (z[:-1][follows] ** 2 + z[1:][follows] ** 2)
-    r = float(product.mean() / max(square.mean(), 1e-12))
-    if r < 0.2:  # short tracks alone give a little
-        return 1.0
-    length = len(z) / max(len(np.unique(track)), 1)
-    return float(min((1 + r) / (1 - min(r, 0.99)), LARGEST_FACTOR, max(length, 1.0)))
-
-
-def _width(whitened: np.ndarray, count: np.ndarray) -> float:
-    """Robust scale of whitened residuals, the part a track's own mean takes away given back; NaN without enough."""
-    use = count >= 3
-    if use.sum() < LEAST_DETECTIONS:
-        return float("nan")
-    return robust_scale((whitened[use] / np.sqrt(1 - 1 / count[use])[:, None]).ravel())
+def shrunk_factor(measured: float, blocks: int, expected: float) -> float:
+    """Factor on covariances: measured from halves of tracks, drawn in the log towards what is expected where they are few."""
+    if expected == 1.0:  # stated scales are believed unless the data speak: two standard errors of a ratio of 3 x blocks squares
+        measured *= max(1 - 2 * np.sqrt(2 / 3 / max(blocks, 1)), 0.0)
+    log_factor = (blocks * np.log(max(measured, 1.0)) + PRIOR_BLOCKS * np.log(expected)) / (blocks + PRIOR_BLOCKS)
+    return float(np.clip(np.exp(log_factor), 1.0, LARGEST_FACTOR))
 
 
 def unstated_range_factor(report: dict[str, float], distance: float) -> float:
-    """Least factor along the ray: as across it where depth is as good as directions, up to four times that where it is not."""
+    """Expected factor along the ray: as across it where depth is as good as directions, up to four times that where it is not."""
     if "position_radial" not in report:
         return UNSTATED_FACTOR
     lateral, radial = (report[f"position_{k}"] + report[f"position_{k}_ratio"] * distance for k in ("lateral", "radial"))
     return UNSTATED_FACTOR * float(np.clip((radial / max(lateral, 1e-12) / POOR_DEPTH) ** 2, 1.0, 4.0))
 
 
-def calibrate(state: SlamState) -> SlamState:
-    """Widen position and rotation scales to the residuals about the solved tracks, and account for their correlation.
+def position_stated(state: SlamState) -> np.ndarray:
+    """Whether each detection's position has a scale that somebody stated, by itself or in the configuration."""
+    stated = np.isfinite(state.problem.observations.position_covariance).all(axis=(1, 2))
+    return stated | (state.config.position_scale is not None) | (state.config.position_ratio is not None)
 
-    Scales the user stated are widened only when they are too small by more than a third (reported) and `correct_scales`.
+
+def calibrate(state: SlamState) -> SlamState:
+    """Fit position and rotation scales to the residuals about the solved tracks, and account for their correlation.
+
+    Scales nobody stated go up and down. Stated ones are widened only when they are too small by more than a third (reported)
+    and `correct_scales`; too wide ones are reported.
     """
-    table, rows = state.problem.observations, state.rows
     noise, config = state.noise, state.config
-    if len(rows) < LEAST_DETECTIONS:
-        if not np.isfinite(table.position_covariance[rows]).any():
-            along = unstated_range_factor(noise.report, state.typical_range)
+    stated, rotation_stated = position_stated(state), np.isfinite(state.problem.observations.rotation_scale)
+    rotation_stated |= config.rotation_scale is not None
+    along = unstated_range_factor(noise.report, state.typical_range)
+    if len(state.rows) < LEAST_DETECTIONS:
+        if not stated[state.rows].any():
             noise = replace(noise, position_factor=UNSTATED_FACTOR, range_factor=along, rotation_factor=UNSTATED_ROTATION_FACTOR)
         return replace(state, noise=noise)
-    frame = table.frame[rows]
-    count = np.bincount(state.landmark, minlength=len(state.static))[state.landmark].astype(np.float64)
     report, warnings = dict(noise.report), list(noise.warnings)
-    predicted = transform(inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
-    whitening = np.linalg.inv(np.linalg.cholesky(noise.position_covariance[rows]))
-    z = np.einsum("kij,kj->ki", whitening, table.position[rows] - predicted)
-    ratio = _width(z, count)
-    stated = np.isfinite(table.position_covariance).all(axis=(1, 2))
-    factor = np.where(
-        stated,
-        _stated_factor(ratio, "position", stated[rows], config.correct_scales, warnings),
-        np.nan_to_num(max(ratio, 1.0), nan=1.0),
-    )
-    report["position_track_width"] = ratio
-    across, along = (
-        (1.0, 1.0) if stated[rows].any() else (UNSTATED_FACTOR, unstated_range_factor(noise.report, state.typical_range))
-    )
-    report["position_correlation_factor"] = position_factor = correlation_factor(z, state.landmark, frame)
-    noise = replace(
-        noise,
-        position_covariance=noise.position_covariance * (factor**2)[:, None, None],
-        position_factor=max(position_factor, across),
-        range_factor=max(position_factor, along),
-    )
-    oriented = np.flatnonzero(table.has_rotation[rows])
-    if len(oriented) >= LEAST_DETECTIONS:
-        k, j = rows[oriented], state.landmark[oriented]
-        R = relative(state.estimate.T_world_camera[table.frame[k]], state.estimate.T_world_landmark[j])[:, :3, :3]
-        seen = state.measurements.select(k)
-        symmetry = seen.symmetry
-        observed = nearest_of_modes(R, seen.modes, symmetry)
-        w = so3_log(np.swapaxes(R, 1, 2) @ observed) / noise.rotation_scale[k][:, None]
-        usable = symmetry != 0
-        if usable.sum() >= LEAST_DETECTIONS:
-            w, k, j = w[usable], k[usable], j[usable]
-            ratio = max((_width(w[:, [c]], count[oriented][usable]) for c in range(3)), default=float("nan"))
-            stated = np.isfinite(table.rotation_scale)
-            factor = np.where(
-                stated,
-                _stated_factor(ratio, "rotation", stated[k], config.correct_scales, warnings),
-                np.nan_to_num(max(ratio, 1.0), nan=1.0),
-            )
+    found = fitted_residuals(state, np.random.default_rng([config.seed, 15485863]))
+    rows = state.rows[found.row]
+    block = halves_of_tracks(state.tracklets.of_observation[rows], state.problem.observations.frame[rows])
+    position, expected = found.observation[:, 3:], found.observation_expected[:, 3:]
+    if len(rows) >= LEAST_DETECTIONS:
+        # The graph's covariances hold the factors in use; what is measured is relative to them.
+        used = (noise.position_factor**2 * noise.range_factor) ** (1 / 3)
+        ratio = _width(position, expected) * np.sqrt(used)
+        report["position_track_width"] = ratio
+        change = _change(ratio, "position", stated[rows], config.correct_scales, warnings)
+        covariance = noise.position_covariance * np.where(stated, change[0], change[1])[:, None, None] ** 2
+        floor = (LEAST_RANGE_PART * state.typical_range) ** 2 * np.eye(3)
+        covariance = np.where(stated[:, None, None], covariance, covariance + floor)
+        measured, blocks = block_ratio(position, expected, block)
+        # Widths of single residuals are given to the scale; what is left of the sums is correlation.
+        report["position_correlation_factor"] = measured = measured * used
+        if stated[rows].mean() > 0.5:
+            factor = along_factor = shrunk_factor(measured, blocks, 1.0)
+        else:
+            factor, along_factor = (shrunk_factor(measured, blocks, prior) for prior in (UNSTATED_FACTOR, along))
+        noise = replace(noise, position_covariance=covariance, position_factor=factor, range_factor=along_factor)
+    whole = found.oriented.any(axis=1)
+    if whole.sum() >= LEAST_DETECTIONS:
+        turn, turn_expected = found.observation[whole, :3], found.observation_expected[whole, :3]
+        axes = found.oriented[whole]
+        used = noise.rotation_factor
+        widths = [
+            _width(turn[axes[:, c], c], turn_expected[axes[:, c], c]) for c in range(3) if axes[:, c].sum() >= LEAST_DETECTIONS
+        ]
+        ratio = max(widths, default=float("nan")) * np.sqrt(used)
+        if np.isfinite(ratio):
+            change = _change(ratio, "rotation", rotation_stated[rows[whole]], config.correct_scales, warnings)
             report["rotation_track_width"] = ratio
-            least = 1.0 if stated[k].any() else UNSTATED_ROTATION_FACTOR
-            report["rotation_correlation_factor"] = rotation_factor = max(correlation_factor(w, j, table.frame[k]), least)
-            noise = replace(noise, rotation_scale=noise.rotation_scale * factor, rotation_factor=rotation_factor)
+            scale = np.maximum(noise.rotation_scale * np.where(rotation_stated, change[0], change[1]), 1e-4)
+            measured, blocks = block_ratio(turn * axes, turn_expected * axes[:, :, None], block[whole])
+            report["rotation_correlation_factor"] = measured = measured * used
+            prior = 1.0 if rotation_stated[rows[whole]].mean() > 0.5 else UNSTATED_ROTATION_FACTOR
+            noise = replace(noise, rotation_scale=scale, rotation_factor=shrunk_factor(measured, blocks, prior))
     clean = {name: value for name, value in report.items() if np.isfinite(value)}
     return replace(state, noise=replace(noise, report=clean, warnings=tuple(dict.fromkeys(warnings))))
 
 
-def _stated_factor(ratio: float, name: str, stated: np.ndarray, correct: bool, warnings: list[str]) -> float:
-    if not stated.any() or not np.isfinite(ratio) or ratio < TOO_SMALL:
-        return 1.0
-    if not any(w.startswith(f"stated {name} scales") for w in warnings):
-        warnings.append(f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide")
-    return ratio if correct else 1.0
+def _width(residual: Float[np.ndarray, ...], expected: Float[np.ndarray, ...]) -> float:
+    return robust_width(residual.ravel(), expected.reshape(residual.size, -1))
+
+
+def _change(ratio: float, name: str, stated: Int[np.ndarray, " k"], correct: bool, warnings: list[str]) -> tuple[float, float]:
+    """Factors on stated and on unstated scales for residuals this wide, with a word where stated ones are wrong."""
+    if not np.isfinite(ratio):
+        return 1.0, 1.0
+    free = max(ratio, LEAST_FACTOR)
+    if not stated.any():
+        return 1.0, free
+    if ratio > TOO_SMALL:
+        if not any(w.startswith(f"stated {name} scales are too small") for w in warnings):
+            warnings.append(f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide")
+        return (ratio if correct else 1.0), free
+    if ratio < 1 / TOO_SMALL:
+        text = f"stated {name} scales are too wide: residuals about whole tracks are {ratio:.2f} times as wide"
+        warnings[:] = [w for w in warnings if not w.startswith(f"stated {name} scales are too wide")] + [text]
+    return 1.0, free
