@@ -14,6 +14,7 @@ import numpy as np
 
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
 from nolbo_ppl.inference.slam.graph import SlamEstimate
+from nolbo_ppl.inference.slam.hypotheses import ambiguity
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, write_voxels
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
@@ -122,6 +123,10 @@ def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, An
         "final_log_evidence": float(np.sum(result.associations.log_evidence)),
         "noise": {k: float(v) for k, v in state.noise.report.items()},
         "warnings": list(state.noise.warnings),
+        "ambiguous": ambiguity(result.hypotheses),
+        "hypotheses": [
+            {"weight": h.weight, "log_evidence": h.log_evidence, "landmarks": len(h.state.static)} for h in result.hypotheses
+        ],
         "seconds": result.seconds,
         "versions": library_versions(),
         "configuration": {k: dict(v) if k == "category_symmetry" else v for k, v in asdict(state.config).items()},

@@ -267,7 +267,7 @@ def frozen_graph(
     covariance = np.zeros((len(g), 6, 6))
     covariance[:, [0, 1, 2], [0, 1, 2]] = np.minimum(modes.angle[g], NO_INFORMATION) ** 2
     covariance[:, [3, 4, 5], [3, 4, 5]] = NO_INFORMATION**2
-    factors = ObservationFactors(frame, j, make_pose(measured, np.zeros(3)), covariance, mode_weights[g, j])
+    factors = ObservationFactors(frame, j, make_pose(measured, np.zeros(3)), covariance, mode_weights[g, j], g)
     add_observation_factors(graph, factors, minimum=SMALLEST_WEIGHT)
     return graph
 

@@ -14,6 +14,49 @@ from nolbo_ppl.geometry.pose import is_rotation
 from nolbo_ppl.inference.association.marginals import Associator
 from nolbo_ppl.io.observations import Detections, check_table
 
+_LIMITS: dict[str, tuple[float, float, bool]] = {
+    "odometry_rotation_scale": (1e-9, 10.0, False),
+    "odometry_translation_scale": (0.0, 1e6, False),
+    "odometry_translation_ratio": (0.0, 1e3, False),
+    "position_scale": (0.0, 1e6, False),
+    "position_ratio": (0.0, 1e3, False),
+    "rotation_scale": (1e-9, 10.0, False),
+    "latent_scale": (1e-12, 1e12, False),
+    "latent_correlation": (0.0, 1.0, False),
+    "new_rate": (1e-30, 1e12, False),
+    "clutter_rate": (1e-30, 1e12, False),
+    "flip_probability": (0.0, 1.0, False),
+    "orientation_outlier": (1e-12, 0.999, False),
+    "category_error": (1e-9, 0.499, False),
+    "track_gap": (0, 10**9, True),
+    "track_minimum": (1, 10**9, True),
+    "motion_log_odds": (0.0, 1e12, False),
+    "samples": (8, 100_000, True),
+    "constellation_size": (2, 10_000, True),
+    "constellation_minimum": (2, 10_000, True),
+    "constellation_log_odds": (-1e6, 1e6, False),
+    "constellation_rounds": (0, 10_000, True),
+    "em_iterations": (0, 10_000, True),
+    "link_minimum": (0.0, 1.0, False),
+    "merge_weight": (0.0, 1.0, False),
+    "robust_width": (1e-6, 1e6, False),
+    "hypotheses": (1, 1000, True),
+    "seed": (0, 2**63 - 1, True),
+}
+"""Least and largest value of every number, and whether it must be whole."""
+
+
+def _check_number(name: str, value: object, low: float, high: float, whole: bool) -> None:
+    """Refuse what is no number, not finite, or out of range.
+
+    Raises:
+        InputError: names the setting.
+    """
+    kind = "a whole number" if whole else "a finite number"
+    good = not isinstance(value, (bool, np.bool_)) and isinstance(value, (int, np.integer) if whole else (int, float, np.number))
+    if not good or not low <= value <= high:  # type: ignore[operator]
+        raise input_error(f"setting `{name}` is out of range", got=value, expected=f"{kind} from {low:g} to {high:g}")
+
 
 @dataclass(frozen=True)
 class SlamConfig:
@@ -81,14 +124,27 @@ class SlamConfig:
     """Tracklets linked by more than this become one landmark."""
     robust_width: float = 1.0
     """Width of the Cauchy kernel on links between tracklets, in standard deviations."""
+    hypotheses: int = 4
+    """Most annealed runs from which the map is chosen by evidence; two that agree end the search. Each costs a whole run."""
     seed: int = 0
     """Seed of the posterior samples."""
     associator: Associator = "exact"
     """How association marginals are computed (see `nolbo_ppl.inference.association`)."""
 
     def __post_init__(self) -> None:
-        if self.latent_correlation is not None and not 0 <= self.latent_correlation < 1:
+        for name, (low, high, whole) in _LIMITS.items():
+            value = getattr(self, name)
+            if value is not None:
+                _check_number(name, value, low, high, whole)
+        if self.latent_correlation is not None and not self.latent_correlation < 1:
             raise input_error("latent_correlation", got=self.latent_correlation, expected="a correlation from 0 to below 1")
+        low_high = tuple(self.objectness_limits)
+        if len(low_high) != 2 or not all(isinstance(x, (int, float)) for x in low_high) or not 0 < low_high[0] < low_high[1] < 1:
+            raise input_error("objectness_limits", got=self.objectness_limits, expected="two numbers, 0 < least < largest < 1")
+        if not len(self.annealing):
+            raise input_error("annealing", got=self.annealing, expected="one factor or more")
+        for factor in self.annealing:
+            _check_number("annealing", factor, 1e-3, 1e6, False)
         if self.objectness_prior is not None and not 0 < self.objectness_prior < 1:
             raise input_error("objectness_prior", got=self.objectness_prior, expected="a share between 0 and 1")
 

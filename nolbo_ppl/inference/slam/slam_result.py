@@ -16,6 +16,7 @@ from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, category
 from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise, to_values
+from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, mixture_covariances
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, Voxels, decode_landmarks
 from nolbo_ppl.inference.slam.map_refinement import final_graph
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -36,6 +37,8 @@ class SlamResult:
     """Time by phase."""
     history: tuple[SlamEstimate, ...] = ()
     """Poses and landmarks of every iteration: odometry first, the result last."""
+    hypotheses: tuple[MapHypothesis, ...] = ()
+    """Distinct maps that explain the detections, with their weights, the best (this one) first."""
 
     @property
     def T_world_camera(self) -> Float[np.ndarray, "n 4 4"]:
@@ -62,12 +65,17 @@ class SlamResult:
         return linearise(self.graph, self.state.estimate)
 
     def pose_covariances(self, rows: Int[np.ndarray, " r"] | None = None) -> Float[np.ndarray, "r 6 6"]:
-        """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed."""
+        """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed.
+
+        Where several hypotheses have weight they are those of the mixture, about this trajectory.
+        """
         rows = np.arange(len(self.T_world_camera)) if rows is None else np.asarray(rows, dtype=np.int64)
         if len(rows) and (rows.min() < 0 or rows.max() >= len(self.T_world_camera)):
             raise input_error(
                 "no such pose", got=[int(rows.min()), int(rows.max())], expected=f"0 to {len(self.T_world_camera) - 1}"
             )
+        if len(self.hypotheses) > 1:
+            return mixture_covariances(self.hypotheses, self.T_world_camera, rows)
         return self.linearisation.covariance(self.linearisation.landmarks + rows)
 
     def landmark_covariances(self) -> Float[np.ndarray, "m 6 6"]:

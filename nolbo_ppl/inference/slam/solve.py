@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from nolbo_ppl.inference.slam.em import EmStepInfo, step
+from nolbo_ppl.inference.slam.hypotheses import ambiguity, explore
 from nolbo_ppl.inference.slam.initialise import SlamState, first_estimate, init
-from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 
@@ -56,21 +56,48 @@ def solve(
     return replace(result, seconds=seconds | result.seconds)
 
 
-def complete(state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None) -> SlamResult:
-    """Iterate a state, finish it, and keep what every iteration held."""
+def complete(
+    state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None, hypotheses: int | None = None
+) -> SlamResult:
+    """Iterate a state to its end, by several runs where they disagree; what every iteration of the best one held is kept.
+
+    Args:
+        state: where the EM begins.
+        on_step: called after each iteration.
+        hypotheses: runs at most; None: as configured.
+    """
     start = first_estimate(
         state.measurements, state.problem.odometry, state.config, state.rows, state.landmark, len(state.static)
     )
-    history = [start]
-
-    def record(state: SlamState, info: EmStepInfo) -> None:
-        history.append(state.estimate)
-        if on_step is not None:
-            on_step(state, info)
-
     clock = time.perf_counter()
-    state, infos = iterate(state, record)
-    middle = time.perf_counter()
-    state, associations = finish(state)
-    seconds = {"em": middle - clock, "map": time.perf_counter() - middle}
-    return SlamResult(state=state, associations=associations, infos=infos, seconds=seconds, history=(*history, state.estimate))
+    config = state.config
+    if hypotheses is not None:
+        state = replace(state, config=replace(config, hypotheses=hypotheses))
+    best, maps = explore(state, iterate, on_step)
+    state = replace(best.state, config=config)
+    warnings = list(state.noise.warnings) + without_a_map(state)
+    text = ambiguity(maps)
+    if text is not None:
+        warnings.append(text)
+    state = replace(state, noise=replace(state.noise, warnings=tuple(dict.fromkeys(warnings))))
+    seconds = {"em": time.perf_counter() - clock}
+    return SlamResult(
+        state=state,
+        associations=best.associations,
+        infos=best.infos,
+        seconds=seconds,
+        history=(start, *best.history, state.estimate),
+        hypotheses=maps,
+    )
+
+
+def without_a_map(state: SlamState) -> list[str]:
+    """Why no landmark is left, in words; nothing where some are."""
+    if len(state.static) or not len(state.problem.observations):
+        return []
+    moving = int(state.tracklets.moving.sum())
+    if moving:
+        return [f"no landmark is left: all {moving} tracks move against the odometry; state the odometry's scales if they do not"]
+    if not len(state.tracklets):
+        return ["no landmark is left: no object was detected twice in a row where the scales expect it"]
+    return ["no landmark is left: every track is more probably background; look at the stated scales, objectness and rates"]

@@ -1,0 +1,166 @@
+"""Several maps where one is not sure: annealed runs from one start, compared by their log evidence.
+
+Which loops an annealed run closes can depend on its samples and on how wide a drift it begins with. Each run differs from the
+first in both. Two that agree end the search; else up to `SlamConfig.hypotheses` of them run. Runs that end at one trajectory
+are one hypothesis; weights are the shares of the evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from nolbo_ppl.geometry.pose import relative, se3_log
+from nolbo_ppl.inference.slam.data_association import Associations
+from nolbo_ppl.inference.slam.em import EmStepInfo
+from nolbo_ppl.inference.slam.graph import SlamEstimate, linearise
+from nolbo_ppl.inference.slam.initialise import base_graph
+from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
+from nolbo_ppl.inference.slam.map_refinement import finish
+from nolbo_ppl.inference.slam.noise.odometry_noise import stated_scales
+from nolbo_ppl.inference.slam.slam_state import SlamState
+
+DRIFT_FACTORS = (1.0, 3.0, 0.5, 6.0)
+"""Factors on odometry scales nobody stated with which the runs begin; further runs repeat them."""
+SAME_MAP = 1.0
+"""Runs whose trajectories are closer than this many typical detection scales are one hypothesis."""
+AMBIGUOUS = 0.05
+"""A rival with more weight than this makes the answer ambiguous."""
+LEAST_WEIGHT = 1e-4
+"""Hypotheses of less weight are not kept."""
+
+
+@dataclass(frozen=True)
+class MapHypothesis:
+    """One of several maps that explain the detections."""
+
+    weight: float
+    """Posterior probability among the hypotheses."""
+    log_evidence: float
+    """Log evidence, nats, comparable between hypotheses."""
+    state: SlamState
+    """Its final state."""
+    associations: Associations
+    """Its associations."""
+
+    @property
+    def T_world_camera(self) -> Float[np.ndarray, "n 4 4"]:
+        """Its trajectory."""
+        return self.state.estimate.T_world_camera
+
+    def pose_covariances(self, rows: np.ndarray) -> Float[np.ndarray, "r 6 6"]:
+        """Covariances of its poses given its associations."""
+        linearisation = linearise(base_graph(self.state), self.state.estimate)
+        return linearisation.covariance(linearisation.landmarks + rows)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One annealed run to its end."""
+
+    state: SlamState
+    associations: Associations
+    infos: tuple[EmStepInfo, ...]
+    history: tuple[SlamEstimate, ...]
+    log_evidence: float
+
+
+def start_of_run(state: SlamState, k: int) -> SlamState:
+    """The state run k begins with: other samples, another drift where nobody stated it."""
+    if k == 0:
+        return state
+    factor = DRIFT_FACTORS[k % len(DRIFT_FACTORS)]
+    rotation, translation = stated_scales(state.problem, state.config)
+    noise = replace(
+        state.noise,
+        rotation_step=state.noise.rotation_step * (1.0 if rotation else factor),
+        translation_step=state.noise.translation_step * (1.0 if translation else factor),
+    )
+    annealing = state.config.annealing
+    if k % 2:  # a slower start, and more samples
+        annealing = (2 * annealing[0], *annealing)
+    config = replace(state.config, seed=state.config.seed + 1000 * k, annealing=annealing, samples=2 * state.config.samples)
+    return replace(state, noise=noise, config=config)
+
+
+def run_to_end(
+    state: SlamState,
+    iterate: Callable[[SlamState, Callable[[SlamState, EmStepInfo], None]], tuple[SlamState, tuple[EmStepInfo, ...]]],
+    on_step: Callable[[SlamState, EmStepInfo], None] | None,
+) -> Run:
+    """Iterate, finish, and weigh."""
+    history: list[SlamEstimate] = []
+
+    def record(state: SlamState, info: EmStepInfo) -> None:
+        history.append(state.estimate)
+        if on_step is not None:
+            on_step(state, info)
+
+    config = state.config
+    state, infos = iterate(state, record)
+    state, associations = finish(state)
+    return Run(replace(state, config=config), associations, infos, tuple(history), map_log_evidence(state))
+
+
+def explore(
+    state: SlamState,
+    iterate: Callable[[SlamState, Callable[[SlamState, EmStepInfo], None]], tuple[SlamState, tuple[EmStepInfo, ...]]],
+    on_step: Callable[[SlamState, EmStepInfo], None] | None = None,
+) -> tuple[Run, tuple[MapHypothesis, ...]]:
+    """The best of up to `SlamConfig.hypotheses` runs, and all distinct maps with their weights, best first."""
+    runs: list[Run] = []
+    same = SAME_MAP * 2 * state.link_scale
+    for k in range(max(state.config.hypotheses, 1)):
+        runs.append(run_to_end(start_of_run(state, k), iterate, on_step))
+        distance = trajectory_distance(runs[0].state.estimate.T_world_camera, runs[-1].state.estimate.T_world_camera)
+        if k == 1 and distance < same and abs(runs[0].log_evidence - runs[1].log_evidence) < 5.0:
+            break
+        if len(state.static) < 2:
+            break
+    runs.sort(key=lambda run: -run.log_evidence)
+    distinct: list[Run] = []
+    for run in runs:
+        T = run.state.estimate.T_world_camera
+        if all(trajectory_distance(T, other.state.estimate.T_world_camera) >= same for other in distinct):
+            distinct.append(run)
+    weight = np.exp(np.array([run.log_evidence for run in distinct]) - distinct[0].log_evidence)
+    weight /= weight.sum()
+    config = state.config
+    kept = [
+        MapHypothesis(float(w), run.log_evidence, replace(run.state, config=config), run.associations)
+        for w, run in zip(weight, distinct)
+        if w > LEAST_WEIGHT
+    ]
+    best = replace(distinct[0], state=replace(distinct[0].state, config=config))
+    return best, tuple(kept)
+
+
+def mixture_covariances(
+    hypotheses: tuple[MapHypothesis, ...], T_world_camera: Float[np.ndarray, "n 4 4"], rows: np.ndarray
+) -> Float[np.ndarray, "r 6 6"]:
+    """Covariances about the given poses of the mixture of all hypotheses: `sum w (C + d d')`, d the other map's pose."""
+    out = np.zeros((len(rows), 6, 6))
+    for hypothesis in hypotheses:
+        away = se3_log(relative(T_world_camera[rows], hypothesis.T_world_camera[rows]))
+        out += hypothesis.weight * (hypothesis.pose_covariances(rows) + away[:, :, None] * away[:, None, :])
+    return out
+
+
+def ambiguity(hypotheses: tuple[MapHypothesis, ...]) -> str | None:
+    """In words what the rivals differ in, or None where there is none to speak of."""
+    rivals = [h for h in hypotheses[1:] if h.weight > AMBIGUOUS]
+    if not rivals:
+        return None
+    best = hypotheses[0]
+    parts = []
+    for rival in rivals:
+        gap = np.linalg.norm(rival.T_world_camera[:, :3, 3] - best.T_world_camera[:, :3, 3], axis=1)
+        worst = int(np.argmax(gap))
+        parts.append(
+            f"one of weight {rival.weight:.2f} is {gap[worst]:.2f} m away at frame {worst} and has "
+            f"{len(rival.state.static)} landmarks for {len(best.state.static)}"
+        )
+    return "ambiguous: other maps explain the detections nearly as well; " + "; ".join(parts)
