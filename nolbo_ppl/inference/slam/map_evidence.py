@@ -9,12 +9,13 @@ landmark too many costs its density and its uncertainty; a wrong merge costs the
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+import scipy.sparse.linalg
+from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, relative, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_latent, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import LOOSE_ROTATION, PRIOR_ROTATION, linearise
+from nolbo_ppl.inference.slam.graph import Linearisation, linearise
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -33,10 +34,21 @@ def map_log_evidence(state: SlamState) -> float:
     value = -0.5 * float(odometry @ odometry) - 3 * float(
         np.sum(np.log(state.noise.rotation_step)) + np.sum(np.log(state.noise.translation_step))
     )
-    m = len(state.static)
-    value += -0.5 * linearisation.log_determinant() + 0.5 * 6 * m * LOG_2PI
-    value += m * (np.log(state.noise.new_rate) + UNIFORM_LOG_DENSITY)
-    return value + float(np.sum(detection_log_odds(state))) + _orientation_volume(state) + feature_log_evidence(state)
+    oriented = state.features.oriented
+    value += -0.5 * _log_determinant(linearisation, oriented) + 1.5 * (len(oriented) + oriented.sum()) * LOG_2PI
+    value += len(oriented) * np.log(state.noise.new_rate) + oriented.sum() * UNIFORM_LOG_DENSITY
+    return float(value + np.sum(detection_log_odds(state)) + feature_log_evidence(state))
+
+
+def _log_determinant(linearisation: Linearisation, oriented: Bool[np.ndarray, " m"]) -> float:
+    """Log determinant of the normal matrix without the rotations of landmarks that have none: their integral is one."""
+    columns = np.ones(linearisation.jacobian.shape[1], dtype=bool)
+    columns[: 6 * len(oriented)].reshape(-1, 6)[:, :3] = oriented[:, None]
+    J = linearisation.jacobian[:, np.flatnonzero(columns)]
+    factor = scipy.sparse.linalg.splu(
+        (J.T @ J).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return float(np.sum(np.log(np.abs(factor.U.diagonal()))))
 
 
 def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
@@ -58,15 +70,6 @@ def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
         log_density[oriented] += turn / noise.rotation_factor
     log_background = seen.log_clutter + np.log(noise.clutter_rate)
     return np.logaddexp(seen.log_object + log_density, log_background) - log_background
-
-
-def _orientation_volume(state: SlamState) -> float:
-    """What the loose rotations of landmarks without an orientation add to the determinant, taken off again."""
-    total = np.bincount(state.landmark, weights=state.weight, minlength=len(state.static))
-    information = (total + PRIOR_ROTATION**-2) / LOOSE_ROTATION**2
-    unoriented = ~state.features.oriented
-    # An integral over all orientations of a density that does not depend on them is one.
-    return float(np.sum(1.5 * np.log(information[unoriented]) - 1.5 * LOG_2PI - UNIFORM_LOG_DENSITY))
 
 
 def feature_log_evidence(state: SlamState) -> float:

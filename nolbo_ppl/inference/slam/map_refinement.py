@@ -21,7 +21,7 @@ from nolbo_ppl.inference.slam.initialise import (
     tracklet_features,
 )
 from nolbo_ppl.inference.slam.loop_candidates import candidate_pairs, posterior_samples
-from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
+from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry, settle_odometry
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
 
 MERGE_LOG_ODDS = 3.0
@@ -146,7 +146,14 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     state = solve_clean(state, repeats=2)
     if len(state.rows):
         state = refine_odometry(state, linearise_state(state))
+        state, (rotation, translation) = settle_odometry(state)
         state = solve_clean(state, repeats=1)
+        if min(rotation, translation) < 1:
+            noise = state.noise
+            stiff = replace(
+                noise, rotation_step=noise.rotation_step * rotation, translation_step=noise.translation_step * translation
+            )
+            state = replace(state, estimate=solve_clean(replace(state, noise=stiff), repeats=1).estimate)
     _, found = reassociate(state, rng)
     return state, found
 

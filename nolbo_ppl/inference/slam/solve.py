@@ -52,27 +52,24 @@ def solve(
     start = time.perf_counter()
     state = init(problem, config)
     seconds = {"tracklets": time.perf_counter() - start}
-    result = complete(state, on_step)
+    result = complete(state, on_step, config.hypotheses)
     return replace(result, seconds=seconds | result.seconds)
 
 
-def complete(
-    state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None, hypotheses: int | None = None
-) -> SlamResult:
+def complete(state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] | None = None, hypotheses: int = 1) -> SlamResult:
     """Iterate a state to its end, by several runs where they disagree; what every iteration of the best one held is kept.
 
     Args:
         state: where the EM begins.
         on_step: called after each iteration.
-        hypotheses: runs at most; None: as configured.
+        hypotheses: runs at most (`solve` takes the configured number).
     """
     start = first_estimate(
         state.measurements, state.problem.odometry, state.config, state.rows, state.landmark, len(state.static)
     )
     clock = time.perf_counter()
     config = state.config
-    if hypotheses is not None:
-        state = replace(state, config=replace(config, hypotheses=hypotheses))
+    state = replace(state, config=replace(config, hypotheses=hypotheses))
     best, maps = explore(state, iterate, on_step)
     state = replace(best.state, config=config)
     warnings = list(state.noise.warnings) + without_a_map(state)

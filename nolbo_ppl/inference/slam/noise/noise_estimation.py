@@ -168,14 +168,28 @@ def _log_components(x: np.ndarray, width: float, ball: float, dimension: int) ->
     return log_normal, np.log(dimension) + (dimension - 1) * log_x - dimension * np.log(ball)
 
 
-def consecutive_pairs(problem: SlamProblem, maximum: int = 4000) -> DetectionPairs:
+def consecutive_pairs(
+    problem: SlamProblem, steps: tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]], maximum: int = 4000
+) -> DetectionPairs:
     """Detections of consecutive frames that are likely (more than a half) of one object, by their gap alone.
 
     Gaps are measured in units of the stated covariances where both are stated, else of the range, whose share is unknown.
+
+    Args:
+        problem: odometry and detections.
+        steps: scales of rotation and translation of the odometry's steps.
+        maximum: about as many detections are looked at.
     """
     table = problem.observations
     first, second, residual = neighbouring_pairs(problem, maximum)
     covariance = table.position_covariance[first] + table.position_covariance[second]
+    if len(first):
+        # The step between the frames errs as well: its scale as stated, else the default.
+        rotation, translation = (np.concatenate([[0.0], np.cumsum(scale**2)]) for scale in steps)
+        begin, end = table.frame[first], table.frame[second]
+        reach = np.sum(table.position[second] ** 2, axis=1)
+        drift = translation[end] - translation[begin] + (rotation[end] - rotation[begin]) * reach
+        covariance = covariance + drift[:, None, None] * np.eye(3)
     stated = np.isfinite(covariance).all(axis=(1, 2))
     weight = np.zeros(len(first))
     distance = np.linalg.norm(table.position[second], axis=1)
@@ -239,13 +253,13 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     Odometry scales nobody stated start from defaults here and are refined on the graph (`refine_odometry`).
     """
     table = problem.observations
-    pairs = consecutive_pairs(problem)
+    rotation_step, translation_step, correlation = step_scales(problem, config)
+    pairs = consecutive_pairs(problem, (rotation_step, translation_step))
     report: dict[str, float] = {"pairs": float(len(pairs.first))}
     warnings: list[str] = []
     covariance = _position_covariance(table, pairs, config, report, warnings)
     rotation_scale = _rotation_scale(problem, pairs, config, report, warnings)
     latent_scale = _latent_scale(table, pairs, config, report, warnings)
-    rotation_step, translation_step, correlation = step_scales(problem, config)
     volume = view_volume(table)
     seen = max(len(np.unique(table.frame)), 1)
     rate = len(table) / seen / volume if len(table) else 1.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.noise.fitted_residuals import squared_ratio
-from nolbo_ppl.inference.slam.noise.noise_estimation import SURE_GAIN, TOO_SMALL
+from nolbo_ppl.inference.slam.noise.noise_estimation import SURE_GAIN, TOO_SMALL, step_scales
 from nolbo_ppl.inference.slam.noise.scale_evidence import scale_evidence, scale_posterior
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -17,16 +17,20 @@ WINDOW = 200
 """Frames the evidence is taken from: where most detections are."""
 GRID = np.log(4.0) * np.arange(-3, 4)
 """Log factors tried on scales nobody stated: 1/64 to 64 times the default."""
+LARGEST_WINDOW = 400
+"""The same for the map at the end, loops closed."""
 STATED_GRID = np.log(4.0) * np.arange(0, 11)
 """The same for stated ones, which are only ever raised: a covariance of 1e-12 is a scale 4 000 times too small."""
 LEAST_TOLD = 10.0
 """Steps' worth of information below which residuals over the posterior change no scale."""
 LARGEST_CHANGE = 4.0
 """Largest factor on a scale in one update."""
-FLAT = float(np.log(3.0))
-"""A scale whose log is known no better than this is called a guess."""
-BIAS_SURE = 4.0
-"""A bias is taken off when it is this many standard deviations from none."""
+LEAST_SUPPORT = 2.0
+"""A correction of the odometry must gain as much log evidence over an odometry without noise, nats."""
+NO_NOISE = 1 / 64
+"""Factor on the default scales that stands for an odometry without noise."""
+WELL_TOLD = 30.0
+"""Steps' worth of information below which a scale nobody stated is called a guess."""
 
 
 def stated_scales(problem: SlamProblem, config: SlamConfig) -> tuple[bool, bool]:
@@ -133,6 +137,61 @@ def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[tup
     for part in (slice(3), slice(3, 6)):
         out.append(squared_ratio(residual[:, part].ravel(), expected[:, part].reshape(-1, expected.shape[2])))
     return out[0], out[1]
+
+
+def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
+    """The scales the answer is given with, and factors on them for the trajectory: what nothing supports is not corrected.
+
+    A scale that the closed map still does not tell is the posterior's mean of the tracks. Then the evidence is compared with
+    that of an odometry without noise, for rotations, translations and both: where it gains less than `LEAST_SUPPORT` the
+    trajectory keeps the odometry's own steps, so that good odometry is not bent by poor detections; the covariances keep the
+    scale. Where scales are guesses a warning says so, and how far half and twice of them would move the trajectory.
+    """
+    free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
+    if not any(free) or len(state.problem) < 3 or not len(state.rows):
+        return state, (1.0, 1.0)
+    report, warnings = dict(state.noise.report), list(state.noise.warnings)
+    names = ("rotation", "translation")
+    told = [report.get(f"odometry_{name}_told", 0.0) for name in names]
+    back = np.array(
+        [
+            np.exp(-report.pop(f"odometry_{name}_log_spread", 0.0)) if is_free and t < LEAST_TOLD else 1.0
+            for name, is_free, t in zip(names, free, told)
+        ]
+    )
+    state = _scaled(state, back, report, warnings)
+    window = densest_window(state, LARGEST_WINDOW)
+    if len(window.problem) < 3 or not len(window.rows):
+        return state, (1.0, 1.0)
+    evidence = scale_evidence(window)
+    default = step_scales(state.problem, state.config)
+    least = [
+        min(NO_NOISE * float(np.median(d) / np.median(used)), 1.0)
+        for d, used in zip(default[:2], (state.noise.rotation_step, state.noise.translation_step))
+    ]
+    choices = [(a, b) for a in ((1.0, least[0]) if free[0] else (1.0,)) for b in ((1.0, least[1]) if free[1] else (1.0,))]
+    values = np.array([evidence.solve(a, b)[0] for a, b in choices])
+    # The choice that keeps most of the odometry among those that nothing speaks against.
+    chosen = max(
+        (k for k in range(len(choices)) if values[k] > values.max() - LEAST_SUPPORT),
+        key=lambda k: ((choices[k][0] < 1) + (choices[k][1] < 1), values[k]),
+    )
+    guesses = [name for name, is_free, t in zip(names, free, told) if is_free and t < WELL_TOLD]
+    if guesses:
+        report = dict(state.noise.report)
+        landmarks, poses = len(window.static), len(window.problem)
+        place = [evidence.solve(*(f if is_free else 1.0 for is_free in free))[1] for f in (1.0, 0.5, 2.0)]
+        moves = [
+            float(np.sqrt(np.mean((x - place[0])[6 * landmarks : 6 * (landmarks + poses)].reshape(-1, 6)[:, 3:] ** 2) * 3))
+            for x in place[1:]
+        ]
+        report["odometry_half_moves"], report["odometry_twice_moves"] = moves
+        warnings.append(
+            f"odometry {' and '.join(guesses)} scale is a guess (nobody stated it, and the detections tell it badly): half of it "
+            f"would move the trajectory by {moves[0]:.3g} m, twice by {moves[1]:.3g} m"
+        )
+        state = replace(state, noise=replace(state.noise, report=report, warnings=tuple(dict.fromkeys(warnings))))
+    return state, choices[chosen]
 
 
 def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState:

@@ -122,6 +122,13 @@ def _change(ratio: float, name: str, stated: Int[np.ndarray, " k"], correct: boo
     free = max(ratio, LEAST_FACTOR)
     if not stated.any():
         return 1.0, free
+    raised = [w for w in warnings if w.startswith(f"stated {name} scales are too small: gaps")]
+    if raised and correct and ratio < 1:
+        # Gaps between frames spoke for it, whole tracks know better: not below what was stated.
+        factor = float(raised[0].split()[-4])
+        if ratio * factor < TOO_SMALL:
+            warnings.remove(raised[0])
+        return max(ratio, 1 / factor), free
     if ratio > TOO_SMALL:
         if not any(w.startswith(f"stated {name} scales are too small") for w in warnings):
             warnings.append(f"stated {name} scales are too small: residuals about whole tracks are {ratio:.2f} times as wide")

@@ -43,7 +43,8 @@ class ScaleEvidence:
     """Steps of the odometry."""
 
     def solve(self, rotation: float, translation: float) -> tuple[float, np.ndarray, np.ndarray]:
-        """Log evidence (nats, up to a constant) of factors on both scales; bias [6] and its covariance."""
+        """Log evidence (nats, up to a constant) of factors on both scales; the solution, whose last six are the bias, and the
+        covariance of these."""
         weight = (1.0, rotation**-2, translation**-2)
         H = sum(w * part for w, part in zip(weight, self.normal)).tocsc()
         g = sum(w * part for w, part in zip(weight, self.gradient))
@@ -55,7 +56,7 @@ class ScaleEvidence:
         error = 0.5 * (sum(w * part for w, part in zip(weight, self.square)) - g @ solution[:, 0])
         determinant = float(np.sum(np.log(np.abs(factor.U.diagonal()))))
         value = -error - 0.5 * determinant - 3 * self.steps * (np.log(rotation) + np.log(translation))
-        return float(value), -solution[-6:, 0], solution[-6:, 1:]
+        return float(value), -solution[:, 0], solution[-6:, 1:]
 
 
 def scale_evidence(state: SlamState) -> ScaleEvidence:
@@ -139,7 +140,7 @@ def scale_posterior(
     best = value.max()
     gain = np.array([best - value[0].max(), best - value[:, 0].max()])
     one = [int(np.argmin(np.abs(axis))) for axis in axes]
-    _, bias, covariance = evidence.solve(float(np.exp(mean[0])), float(np.exp(mean[1])))
+    _, solution, covariance = evidence.solve(float(np.exp(mean[0])), float(np.exp(mean[1])))
     return ScalePosterior(
-        mean, deviation, gain, float(best - value[one[0], one[1]]), bias, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        mean, deviation, gain, float(best - value[one[0], one[1]]), solution[-6:], np.sqrt(np.maximum(np.diag(covariance), 0.0))
     )

@@ -1,0 +1,180 @@
+"""Evidence of pairs of tracklets, of groups of them, and what is joined to what, each against an independent computation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import networkx
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal, norm
+
+from nolbo_ppl.inference.slam import SlamConfig
+from nolbo_ppl.inference.slam.clusters import join
+from nolbo_ppl.inference.slam.consistent_cliques import close_constellations, find_closing, joint_log_density, windows
+from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
+from nolbo_ppl.inference.slam.loop_candidates import (
+    POSITION_GATE,
+    PosteriorSamples,
+    TrackletFeatures,
+    candidate_pairs,
+    log_population,
+)
+
+PRIOR = FeaturePrior(np.zeros(2), np.ones(2), (), np.zeros(0), 0.05)
+
+
+def features(
+    m: int, latent: np.ndarray | None = None, variance: float = 0.1, first: np.ndarray | None = None
+) -> TrackletFeatures:
+    z = np.zeros((m, 0)) if latent is None else latent
+    spread = np.full(z.shape, variance)
+    first = 10 * np.arange(m) if first is None else first
+    return TrackletFeatures(
+        z, spread, log_population(z, spread), np.full(m, -1), np.ones(m, int), np.zeros(m, bool), first, first + 1
+    )
+
+
+def poses(position: np.ndarray) -> SlamEstimate:
+    T = np.tile(np.eye(4), (len(position), 1, 1))
+    T[:, :3, 3] = position
+    return SlamEstimate(np.eye(4)[None], T)
+
+
+def still(m: int, count: int = 64) -> PosteriorSamples:
+    return PosteriorSamples(np.zeros((m, 3, count)), np.zeros((m, 3, count)))
+
+
+def test_population_density_by_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    z, v = rng.standard_normal((6, 2)), rng.uniform(0.1, 1.0, (6, 2))
+    for i, value in enumerate(log_population(z, v)):
+        others = [norm.pdf(z[i], z[c], np.sqrt(v[i] + v[c])).prod() for c in range(6) if c != i]
+        assert value == pytest.approx(np.log(np.mean(others)), abs=1e-10)
+
+
+def test_pair_evidence_is_the_density_of_the_gap() -> None:
+    """Position: the normal density of the gap under the samples' covariance; latent: the match against the population."""
+    rng = np.random.default_rng(1)
+    m, count = 5, 40
+    position = rng.uniform(-1, 1, (m, 3))
+    deviation = 0.4 * rng.standard_normal((m, 3, count))
+    z = rng.standard_normal((m, 2))
+    data = features(m, z, 0.3)
+    found = candidate_pairs(
+        poses(position), PosteriorSamples(deviation, 0 * deviation), data, PRIOR, SlamConfig(), inflation=2.0, floor=0.1
+    )
+    expected = {}
+    for a in range(m):
+        for b in range(a):
+            d = deviation[a] - deviation[b]
+            covariance = 2.0 * d @ d.T / count + 0.01 * np.eye(3)
+            gap = position[a] - position[b]
+            if gap @ np.linalg.solve(covariance, gap) < POSITION_GATE:
+                latent = norm.logpdf(z[a], z[b], np.sqrt(0.6)).sum() - data.log_population[a]
+                expected[a, b] = (multivariate_normal.logpdf(gap, np.zeros(3), covariance), latent)
+    assert {(int(a), int(b)) for a, b in zip(found.a, found.b)} == set(expected) and len(expected) > 3
+    for k, pair in enumerate(zip(found.a.tolist(), found.b.tolist())):
+        assert (found.log_position[k], found.log_feature[k]) == pytest.approx(expected[pair], abs=1e-9)
+
+
+def test_tracklets_seen_together_are_no_pair() -> None:
+    data = features(3, first=np.array([0, 0, 5]))
+    found = candidate_pairs(poses(np.zeros((3, 3))), still(3), data, PRIOR, SlamConfig(), inflation=1.0, floor=0.1)
+    assert {(int(a), int(b)) for a, b in zip(found.a, found.b)} == {(2, 0), (2, 1)}
+
+
+def test_joint_density_of_a_group_equals_the_dense_normal() -> None:
+    """Drift of six directions common to all gaps plus a part of each one's own."""
+    rng = np.random.default_rng(2)
+    size, count = 4, 60_000
+    common, own = 0.5 * rng.standard_normal((3 * size, 6)), 0.2
+    flat = common @ rng.standard_normal((6, count))
+    gap = rng.standard_normal((size, 3))
+    exact = common @ common.T + own**2 * np.eye(3 * size)
+    value = joint_log_density(gap, flat.reshape(size, 3, count), 1.0, own)
+    # The covariance is sampled: its relative error is sqrt(2 / count) an element.
+    tolerance = 5 * np.sqrt(2 / count) * (gap.ravel() @ np.linalg.solve(exact, gap.ravel()) + 3 * size)
+    assert value == pytest.approx(multivariate_normal.logpdf(gap.ravel(), np.zeros(3 * size), exact), abs=tolerance)
+
+
+def second_pass(shift: np.ndarray, wrong: np.ndarray | None = None) -> tuple[np.ndarray, PosteriorSamples, np.random.Generator]:
+    """Six objects, seen again after a drift common to all; optionally a copy of the constellation elsewhere."""
+    rng = np.random.default_rng(3)
+    old = rng.uniform(0, 30, (6, 3)) * np.array([1, 0.1, 1])
+    parts = [old] if wrong is None else [old, old + wrong]
+    parts.append(old + shift + 0.02 * rng.standard_normal((6, 3)))
+    drift = 4.0 * rng.standard_normal((1, 3, 64))
+    olds = 6 * (len(parts) - 1)
+    deviation = np.concatenate([0.02 * rng.standard_normal((olds, 3, 64)), np.repeat(drift, 6, axis=0)])
+    return np.concatenate(parts), PosteriorSamples(deviation, 0 * deviation), rng
+
+
+def closing(position: np.ndarray, samples: PosteriorSamples) -> tuple[object, int]:
+    m = len(position)
+    first = np.concatenate([np.arange(m - 6), np.full(6, 1000)])
+    config = SlamConfig()
+    pairs = candidate_pairs(poses(position), samples, features(m, first=first), PRIOR, config, inflation=1.0, floor=0.05)
+    fresh = pairs.select(pairs.a >= m - 6)
+    return find_closing(fresh, poses(position), samples, config, inflation=1.0, floor=0.05, log_new=float(np.log(1e-3))), m
+
+
+def test_constellation_is_found_and_twins_are_refused() -> None:
+    position, samples, _ = second_pass(np.array([3.0, 0.1, -2.0]))
+    found, m = closing(position, samples)
+    assert found is not None and sorted(zip(found.a.tolist(), found.b.tolist())) == [(m - 6 + i, i) for i in range(6)]  # type: ignore[attr-defined]
+    config = SlamConfig()
+    assert found.margin > config.constellation_log_odds  # type: ignore[attr-defined]
+    twins, _ = closing(*second_pass(np.array([3.0, 0.1, -2.0]), wrong=np.array([5.0, 0.2, -3.5]))[:2])
+    assert twins is not None and twins.margin < config.constellation_log_odds / 2  # type: ignore[attr-defined]
+
+
+def test_closings_use_no_tracklet_twice() -> None:
+    position, samples, _ = second_pass(np.array([3.0, 0.1, -2.0]))
+    first = np.concatenate([np.arange(6), 1000 + np.arange(6)])
+    data = features(12, first=first)
+    config = replace(SlamConfig(), constellation_size=4)
+    pairs = candidate_pairs(poses(position), samples, data, PRIOR, config, inflation=1.0, floor=0.05)
+    accepted = close_constellations(
+        pairs, first, poses(position), samples, config, inflation=1.0, floor=0.05, log_new=float(np.log(1e-3))
+    )
+    partner: dict[int, int] = {}
+    for a, b in ((int(a), int(b)) for c in accepted for a, b in zip(c.a, c.b)):
+        assert partner.setdefault(a, b) == b
+    assert partner == {6 + i: i for i in range(6)}
+
+
+def test_windows_hold_every_tracklet() -> None:
+    first = np.random.default_rng(0).permutation(50)
+    found = windows(first, 14)
+    assert set(np.concatenate(found).tolist()) == set(range(50)) and all(len(w) <= 14 for w in found)
+    for window in found:
+        assert (np.diff(first[window]) == 1).all()  # neighbours in time
+
+
+def links(a: list[int], b: list[int], weight: list[float]) -> Links:
+    return Links(np.array(a), np.array(b), np.array(weight), np.tile(np.eye(4), (len(a), 1, 1)), np.ones((len(a), 2)))
+
+
+def test_clusters_are_components_of_strong_links() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        m = 12
+        a, b, w = rng.integers(m, size=15), rng.integers(m, size=15), rng.uniform(size=15)
+        apart = [frozenset({i}) for i in range(m)]  # never seen together: plain components
+        found = join(links(a.tolist(), b.tolist(), w.tolist()), apart, 0.5)
+        graph = networkx.Graph()
+        graph.add_nodes_from(range(m))
+        graph.add_edges_from([(int(x), int(y)) for x, y, z in zip(a, b, w) if z > 0.5])
+        groups = {frozenset(c) for c in networkx.connected_components(graph)}
+        assert {frozenset(np.flatnonzero(found == k).tolist()) for k in np.unique(found)} == groups
+        # With frames of their own in common no cluster may hold two of one frame, and the strongest link is kept.
+        frames = [frozenset(rng.integers(6, size=2).tolist()) for _ in range(m)]
+        found = join(links(a.tolist(), b.tolist(), w.tolist()), frames, 0.5)
+        for k in np.unique(found):
+            members = [frames[i] for i in np.flatnonzero(found == k)]
+            assert sum(map(len, members)) == len(frozenset().union(*members))
+        best = int(np.argmax(w))
+        if a[best] != b[best] and w[best] > 0.5 and frames[a[best]].isdisjoint(frames[b[best]]):
+            assert found[a[best]] == found[b[best]]
