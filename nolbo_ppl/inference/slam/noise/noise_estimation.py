@@ -393,7 +393,7 @@ def _rotation_scale(
             ratio = robust_scale(normalised[use], np.broadcast_to(weight[stated, None], use.shape)[use])
             report["rotation_ratio_to_stated"] = ratio
             if ratio > TOO_SMALL and len(values):
-                warnings.append(f"stated rotation scales are too small: residuals are {ratio:.2f} times as wide")
+                warnings.append(f"stated rotation scales are too small: gaps between frames are {ratio:.2f} times as wide")
                 if config.correct_scales:
                     scale = scale * ratio
     return np.where(np.isfinite(scale), scale, 0.1 if default is None else default)
@@ -421,7 +421,7 @@ def _latent_scale(
             ratio = robust_scale(normalised, np.repeat(pairs.weight[both][stated], difference.shape[1]))
             report["latent_ratio_to_stated"] = ratio
             if ratio > TOO_SMALL:
-                warnings.append(f"stated latent scales are too small: residuals are {ratio:.2f} times as wide")
+                warnings.append(f"stated latent scales are too small: gaps between frames are {ratio:.2f} times as wide")
                 if config.correct_scales:
                     scale = scale * ratio
     return np.where(np.isfinite(scale), scale, 1.0 if default is None else default)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.noise.fitted_residuals import block_ratio, fitted_residuals, halves_of_tracks, robust_width
-from nolbo_ppl.inference.slam.noise.noise_estimation import LEAST_RANGE_PART, TOO_SMALL
+from nolbo_ppl.inference.slam.noise.noise_estimation import LEAST_RANGE_PART, TOO_SMALL, robust_scale
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 LARGEST_FACTOR = 20.0
@@ -107,8 +107,31 @@ def calibrate(state: SlamState) -> SlamState:
             report["rotation_correlation_factor"] = measured = measured * used
             prior = 1.0 if rotation_stated[rows[whole]].mean() > 0.5 else UNSTATED_ROTATION_FACTOR
             noise = replace(noise, rotation_scale=scale, rotation_factor=shrunk_factor(measured, blocks, prior))
+    ratio = latent_width(state)
+    if np.isfinite(ratio):
+        latent_stated = np.isfinite(state.problem.observations.latent_scale).all(axis=1) | (config.latent_scale is not None)
+        change = _change(ratio, "latent", latent_stated[state.rows], config.correct_scales, warnings)
+        report["latent_track_width"] = ratio
+        noise = replace(noise, latent_scale=noise.latent_scale * np.where(latent_stated, change[0], change[1])[:, None])
     clean = {name: value for name, value in report.items() if np.isfinite(value)}
     return replace(state, noise=replace(noise, report=clean, warnings=tuple(dict.fromkeys(warnings))))
+
+
+def latent_width(state: SlamState) -> float:
+    """Scale of latents about their tracks' means, in units of their scales; NaN without enough of them."""
+    rows = state.rows[(state.weight > 0.5) & state.problem.observations.has_latent[state.rows]]
+    track = state.tracklets.of_observation[rows]
+    count = np.bincount(track[track >= 0], minlength=len(state.tracklets)) if len(rows) else np.zeros(0, int)
+    rows = rows[(track >= 0) & (count[track] >= 2)]
+    if len(rows) < LEAST_DETECTIONS:
+        return float("nan")
+    track = np.unique(state.tracklets.of_observation[rows], return_inverse=True)[1]
+    latent, scale = state.problem.observations.latent[rows], state.noise.latent_scale[rows]
+    precision, total = (np.zeros((track.max() + 1, latent.shape[1])) for _ in range(2))
+    np.add.at(precision, track, scale**-2.0)
+    np.add.at(total, track, latent / scale**2)
+    left = 1 - scale**-2.0 / precision[track]
+    return robust_scale(((latent - (total / precision)[track]) / scale / np.sqrt(np.maximum(left, 1e-9))).ravel())
 
 
 def _width(residual: Float[np.ndarray, ...], expected: Float[np.ndarray, ...]) -> float:
@@ -122,7 +145,7 @@ def _change(ratio: float, name: str, stated: Int[np.ndarray, " k"], correct: boo
     free = max(ratio, LEAST_FACTOR)
     if not stated.any():
         return 1.0, free
-    raised = [w for w in warnings if w.startswith(f"stated {name} scales are too small: gaps")]
+    raised = [w for w in warnings if w.startswith(f"stated {name} scales are too small: gaps between frames")]
     if raised and correct and ratio < 1:
         # Gaps between frames spoke for it, whole tracks know better: not below what was stated.
         factor = float(raised[0].split()[-4])

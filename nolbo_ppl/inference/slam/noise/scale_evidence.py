@@ -47,7 +47,7 @@ class ScaleEvidence:
         covariance of these."""
         weight = (1.0, rotation**-2, translation**-2)
         H = sum(w * part for w, part in zip(weight, self.normal)).tocsc()
-        g = sum(w * part for w, part in zip(weight, self.gradient))
+        g = np.sum([w * part for w, part in zip(weight, self.gradient)], axis=0)
         factor = scipy.sparse.linalg.splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         right = np.zeros((len(g), 7))
         right[:, 0] = g
