@@ -63,6 +63,10 @@ class EvaluateConfig:
     """Generated scenes: easy, standard or full."""
     cad: Path | None = None
     """Folder of CAD shapes to generate scenes from, in place of parametric ones."""
+    cad_up: str | None = None
+    """The axis of the CAD files that points up; by default +y of GLB and glTF, +z of the others."""
+    cad_front: str | None = None
+    """The axis that their front faces; by default +z of files with y up, -y of those with z up."""
     backgrounds: Path | None = None
     """Folder of photographs behind generated scenes."""
     sizes: tuple[int, ...] = ()
@@ -109,7 +113,7 @@ def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSourc
     if config.cad is not None:
         from nolbo_ppl.synthetic.assets.cad import load_cad_folder
 
-        cad = tuple(load_cad_folder(config.cad, model_config.categories))
+        cad = tuple(load_cad_folder(config.cad, model_config.categories, up=config.cad_up, front=config.cad_front))
     return SceneSource(
         preset(config.difficulty, rendered_size(model_config.image_size)),
         seed=config.seed,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,11 @@ from tqdm import tqdm
 
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence
 from nolbo_ppl.data.sequences.opening import open_frames
+from nolbo_ppl.data.sequences.undistorted import guessed_camera, without_distortion
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
+from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.files import atomic_path, write_jsonl
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
@@ -32,6 +34,8 @@ class ObserveConfig:
     """Name of weights in the package, or a folder with a model of your own."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
+    camera: Path | None = None
+    """A file with the camera instead (see `nolbo run --intrinsics`), whose distortion is taken out of the images."""
     threshold: float = 0.3
     """Least objectness of a detection."""
     pictures: bool = True
@@ -55,17 +59,25 @@ class ObserveSummary:
     """Lines of observations.jsonl."""
     file: Path
     """The observations."""
+    guessed: str = ""
+    """What a guessed camera means for the positions; empty where the camera was given."""
 
 
 def run(config: ObserveConfig) -> ObserveSummary:
     """Observe every image of the folder; `observations.jsonl` appears complete or not at all."""
     frames, model = open_frames(config.images), load(config.model)
+    if config.camera is not None:
+        if config.intrinsics is not None:
+            raise input_error("--camera and --intrinsics", got="both", expected="one of the two")
+        frames, camera = without_distortion(frames, read_camera(config.camera, frames.size))
+        config = replace(config, intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy))
     if config.out.resolve() == config.images.resolve():
         raise input_error("pictures would be written over the images", got=config.out, do="choose another --out")
     config.out.mkdir(parents=True, exist_ok=True)
     rows = list(_rows(config, frames, model))
     write_jsonl(config.out / "observations.jsonl", rows)
-    return ObserveSummary(len(frames), len(rows), config.out / "observations.jsonl")
+    guessed = guessed_camera(frames.size)[1] if config.intrinsics is None else ""
+    return ObserveSummary(len(frames), len(rows), config.out / "observations.jsonl", guessed)
 
 
 def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel) -> Iterator[dict]:
@@ -99,6 +111,8 @@ def main(args: Sequence[str] | None = None) -> None:
 
     summary = run(tyro.cli(ObserveConfig, args=args, prog="nolbo observe", description=__doc__))
     sys.stdout.write(f"{summary.detections} objects in {summary.images} images: {summary.file}\n")
+    if summary.guessed:
+        sys.stdout.write(summary.guessed + "\n")
 
 
 if __name__ == "__main__":

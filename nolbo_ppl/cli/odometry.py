@@ -12,9 +12,18 @@ from typing import Any, Literal
 import numpy as np
 
 from nolbo_ppl._version import __version__
-from nolbo_ppl.data.sequences import FrameSequence, open_frames, read_intrinsics, read_lengths
+from nolbo_ppl.data.sequences import (
+    FrameSequence,
+    ImageFolder,
+    guessed_camera,
+    open_frames,
+    read_camera,
+    read_lengths,
+    without_distortion,
+)
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, write_json
+from nolbo_ppl.io.images import exif_focal_length
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, read_frame_poses, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, path_length
 from nolbo_ppl.odometry import (
@@ -35,10 +44,11 @@ class OdometryArguments:
 
     images: Path
     """Folder of images (KITTI, TUM RGB-D, any names) or a video."""
-    intrinsics: Path
-    """intrinsics.json, a KITTI calib.txt, or a text file with fx fy cx cy."""
     out: Path
     """Folder for odometry.txt, odometry_covariance.npz and odometry.json."""
+    intrinsics: Path | None = None
+    """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, intrinsics.json, a KITTI calib.txt, or a text file with fx fy cx cy
+    and the distortion, which is taken out of the images. Without a file the camera is guessed."""
     scale: Literal["truth", "ground", "file"] = "ground"
     """Length of the steps: of the true trajectory, from the ground under the camera, or of a file (a wheel)."""
     truth: Path | None = None
@@ -171,8 +181,14 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
     Raises:
         InputError: unusable input; nothing half-written is left.
     """
-    part = part_of(open_frames(arguments.images), arguments.first, arguments.count)
-    intrinsics = read_intrinsics(arguments.intrinsics, part.frames.size)
+    frames, remarks = open_frames(arguments.images), list[str]()
+    if arguments.intrinsics is None:
+        first = frames.files[0] if isinstance(frames, ImageFolder) else None
+        camera, remark = guessed_camera(frames.size, None if first is None else exif_focal_length(first))
+        remarks.append(remark)
+    else:
+        frames, camera = without_distortion(frames, read_camera(arguments.intrinsics, frames.size))
+    part, intrinsics = part_of(frames, arguments.first, arguments.count), camera.vector
     truth = None if arguments.truth is None else true_poses(arguments.truth, part)
     scale = scale_of(arguments, part, truth)
     begin = time.perf_counter()
@@ -181,7 +197,7 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
     options = {
         name: str(value) if isinstance(value, Path) else value for name, value in asdict(arguments).items() if name != "config"
     }
-    report = {"version": __version__, "options": options, "config": asdict(arguments.config), **figures}
+    report = {"version": __version__, "options": options, "config": asdict(arguments.config), **figures, "remarks": remarks}
     write_odometry(arguments.out, odometry, frame_times(part), report)
     return odometry, report
 
@@ -198,6 +214,7 @@ def describe(report: dict[str, Any]) -> str:
     if "ate" in report:
         percent = "" if report["ate_percent"] is None else f" ({report['ate_percent']:.2f} % of the way)"
         lines.append(f"ATE {report['ate']:.3f} m{percent}")
+    lines += report.get("remarks", [])
     return "\n".join(lines)
 
 

@@ -26,7 +26,8 @@ def main(args: Sequence[str] | None = None) -> None:
 
     config = tyro.cli(RunConfig, args=args, prog="nolbo run", description=__doc__)
     summary = run(config)
-    sys.stdout.write(figure_table(summary) + f"\nwritten to {config.out}\n")
+    remarks = "".join(f"\n{text}" for text in summary.get("remarks", []))
+    sys.stdout.write(figure_table(summary) + remarks + f"\nwritten to {config.out}\n")
 
 
 if __name__ == "__main__":

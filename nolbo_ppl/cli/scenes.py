@@ -28,6 +28,10 @@ class ScenesConfig:
     """Which scenes and which shapes; another seed shows unseen scenes of unseen shapes."""
     cad: Path | None = None
     """Folder of CAD meshes (OFF, OBJ, PLY, GLB in a sub-folder per category) in place of the generated shapes."""
+    up: str | None = None
+    """The axis of the CAD files that points up, x, y or z with its sign; by default +y of GLB and glTF, +z of the others."""
+    front: str | None = None
+    """The axis that their front faces; by default +z of files with y up, -y of those with z up."""
     backgrounds: Path | None = None
     """Folder of photographs behind the objects. What they show of the twelve categories is not labelled."""
     size: int = 128
@@ -46,7 +50,7 @@ def source_of(config: ScenesConfig) -> SceneSource:
     if config.cad is not None:
         from nolbo_ppl.synthetic.assets.cad import load_cad_folder
 
-        cad = tuple(load_cad_folder(config.cad, CATEGORIES))
+        cad = tuple(load_cad_folder(config.cad, CATEGORIES, up=config.up, front=config.front))
     backgrounds = None if config.backgrounds is None else str(config.backgrounds)
     return SceneSource(preset(config.difficulty, config.size), config.seed, config.instances, backgrounds, cad)
 

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nolbo_ppl.errors import input_error
+
 
 def box_area(box: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
     """Area in square pixels; a reversed box has none."""
@@ -65,3 +67,48 @@ def suppress(
     stands_for = torch.empty_like(order)
     stands_for[order] = order[torch.from_numpy(owner)]
     return order[torch.tensor(kept, dtype=torch.long)], stands_for
+
+
+LEAST_SIDE = 1.0
+"""Shortest side, px, of a box that says where in an image something is."""
+
+
+def boxes_in_image(boxes: object, size: tuple[int, int], image: int = 0) -> Float[np.ndarray, "n 4"]:
+    """Given boxes [x0, y0, x1, y1] in px, cut to the image.
+
+    Args:
+        boxes: an array or nested lists, n boxes of 4 numbers.
+        size: width and height of the image, px.
+        image: its number, for messages.
+
+    Raises:
+        InputError: no such array, corners that are not finite or not in order, a box outside of the image or less than a
+            pixel wide; names image and box.
+
+    Example:
+        >>> boxes_in_image([[-5.0, 20.0, 30.0, 60.0]], (100, 50)).tolist()
+        [[0.0, 20.0, 30.0, 50.0]]
+    """
+    try:
+        found = np.asarray(boxes, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.zeros((1, 1))
+    found = found.reshape(-1, 4) if found.size == 0 else found
+    if found.ndim != 2 or found.shape[1] != 4:
+        raise input_error(f"boxes of image {image}", got=f"shape {np.shape(found)}", expected="n rows of x0 y0 x1 y1, px")
+    width, height = size
+    cut = np.clip(found, 0, [width, height, width, height])
+    finite = np.isfinite(found).all(axis=1)
+    ordered = finite & (found[:, 0] < found[:, 2]) & (found[:, 1] < found[:, 3])
+    inside = ordered & (cut[:, 2] > cut[:, 0]) & (cut[:, 3] > cut[:, 1])
+    wide = inside & (np.minimum(cut[:, 2] - cut[:, 0], cut[:, 3] - cut[:, 1]) >= LEAST_SIDE)
+    for good, expected, do in (
+        (finite, "finite x0 y0 x1 y1", None),
+        (ordered, "x0 < x1 and y0 < y1", "corners, not a corner with width and height"),
+        (inside, f"a box that touches the image of {width} x {height} px", None),
+        (wide, "at least a pixel each way", "boxes are in px, not in fractions of the image"),
+    ):
+        if not good.all():
+            k = int(np.argmin(good))
+            raise input_error(f"box {k} of image {image}", got=found[k].tolist(), expected=expected, do=do)
+    return cut

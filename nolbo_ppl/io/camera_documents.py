@@ -230,7 +230,8 @@ def distortion_of(fields: Mapping[str, Any], path: Path) -> tuple[DistortionMode
         model = "rational"
     if len(values) == 5 and model == "rational":
         model = "radial-tangential"
-    if len(values) not in COUNTS[model]:
-        expected = " or ".join(map(str, COUNTS[model]))
+    counts = COUNTS[model or "radial-tangential"]
+    if len(values) not in counts:
+        expected = " or ".join(map(str, counts))
         raise input_error(f"{model} distortion", got=f"{len(values)} numbers", expected=expected, file=path)
     return model, tuple(float(v) for v in values)

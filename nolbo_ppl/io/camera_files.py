@@ -150,7 +150,7 @@ def _from_json(path: Path) -> CameraIntrinsics:
             do="what is not understood may be what the images need",
             file=path,
         )
-    if not any(name in content for name in NAMES) and len(content) > 0:
+    if "fx" not in content and ("fl_x" in content or not any(name in content for name in NAMES)):
         return _from_fields(fields_of(content, path), path)
     extra = fields_of({**dict.fromkeys(NAMES, 0.0), **content}, path)
     return _from_fields({**extra, **{name: content.get(name) for name in NAMES}}, path)

@@ -195,6 +195,19 @@ def image_size(path: str | PathLike[str], *, named_by: Source | None = None) -> 
         return (image.height, image.width) if turned else (image.width, image.height)
 
 
+def exif_focal_length(path: str | PathLike[str]) -> float | None:
+    """Focal length in px from the 35 mm equivalent that a camera wrote into a photograph; None where there is none.
+
+    The longer side of the picture is taken for the 36 mm of a film.
+    """
+    with _opened(path, None) as image:
+        try:
+            equivalent = float(image.getexif().get_ifd(0x8769).get(0xA405, 0))
+        except Exception:  # damaged EXIF data say nothing
+            return None
+        return equivalent / 36 * max(image.size) if 5 <= equivalent <= 1000 else None
+
+
 def open_depth_image(path: str | PathLike[str], *, named_by: Source | None = None) -> Int[np.ndarray, "h w"]:
     """Values of an image of one channel of 16 or 32 bits, unscaled, as int64.
 

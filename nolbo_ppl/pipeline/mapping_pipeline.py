@@ -185,7 +185,7 @@ class ObjectMappingPipeline:
         )
         if objects is not None:
             write_json(self.out / "objects.json", objects)
-        write_json(self.out / "summary.json", summary)
+        write_json(self.out / "summary.json", summary | {"remarks": list(self.drive.remarks)})
 
     def report(self) -> None:
         """report.html."""

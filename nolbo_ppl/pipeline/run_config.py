@@ -16,10 +16,11 @@ class RunConfig:
 
     images: Path
     """Folder of images (plain, KITTI or TUM), or a video file."""
-    intrinsics: Path
-    """The camera: JSON with fx, fy, cx, cy in px of the images, a KITTI calib.txt, or four numbers."""
     out: Path
     """Folder of the run. Stages that are complete in it are not done again."""
+    intrinsics: Path | None = None
+    """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, JSON with fx, fy, cx, cy in px of the images, a KITTI calib.txt, or
+    numbers. Its distortion is taken out of the images. Without a file the camera is guessed, which makes ranges wrong."""
     odometry: Path | None = None
     """Odometry of every image, T_world_camera (KITTI or TUM rows); without it visual odometry is run."""
     truth: Path | None = None

@@ -9,8 +9,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from nolbo_ppl.data.sequences import CameraIntrinsics, FrameSequence, ImageFolder, open_frames, read_camera, read_lengths
+from nolbo_ppl.data.sequences import (
+    CameraIntrinsics,
+    FrameSequence,
+    ImageFolder,
+    UndistortedFrames,
+    guessed_camera,
+    open_frames,
+    read_camera,
+    read_lengths,
+    without_distortion,
+)
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.images import exif_focal_length
 from nolbo_ppl.io.trajectories import covariance_beside, poses_of_frames, read_frame_poses
 from nolbo_ppl.odometry import (
     GroundHeight,
@@ -39,6 +50,8 @@ class RunInputs:
     """Images that are looked at: every so many-th."""
     truth: Poses | None
     """True pose of every image; NaN where it is not known."""
+    remarks: tuple[str, ...] = ()
+    """What a reader of the figures has to know of the input."""
 
     @property
     def intrinsics(self) -> Float[np.ndarray, " 4"]:
@@ -47,15 +60,20 @@ class RunInputs:
 
     def file(self, k: int) -> Path:
         """The file of an image; of a video, its name inside the video."""
-        if isinstance(self.frames, ImageFolder):
-            return self.frames.files[k]
-        return self.frames.path / self.frames.name(k)
+        source = self._source
+        return source.files[k] if isinstance(source, ImageFolder) else source.path / source.name(k)
+
+    @property
+    def _source(self) -> FrameSequence:
+        """The images as they are in files."""
+        return self.frames.source if isinstance(self.frames, UndistortedFrames) else self.frames
 
     def fingerprint(self) -> Any:
         """What tells one sequence of images from another: names and sizes of its files."""
-        if isinstance(self.frames, ImageFolder):
-            return [[file.name, file.stat().st_size] for file in self.frames.files]
-        return [len(self.frames), self.frames.path.stat().st_size]
+        source = self._source
+        if isinstance(source, ImageFolder):
+            return [[file.name, file.stat().st_size] for file in source.files]
+        return [len(source), source.path.stat().st_size]
 
 
 @dataclass(frozen=True)
@@ -97,11 +115,21 @@ def open_drive(config: RunConfig) -> RunInputs:
         InputError: one of them is missing or malformed, or they do not fit each other.
     """
     frames = open_frames(config.images)
-    camera = read_camera(config.intrinsics, frames.size)
+    remarks: list[str] = []
+    if config.intrinsics is None:
+        first = frames.files[0] if isinstance(frames, ImageFolder) else None
+        camera, remark = guessed_camera(frames.size, None if first is None else exif_focal_length(first))
+        remarks.append(remark)
+    else:
+        frames, camera = without_distortion(frames, read_camera(config.intrinsics, frames.size))
+        if isinstance(frames, UndistortedFrames) and (config.depth is not None or config.right is not None):
+            raise input_error("--depth or --right with a distorted camera", expected="images that were rectified together")
     truth = None
     if config.truth is not None:
-        truth = read_frame_poses(config.truth, len(frames), frames.times, of="the images").T_world_camera
-    return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth)
+        found = read_frame_poses(config.truth, len(frames), frames.times, of="the images")
+        truth = found.T_world_camera
+        remarks += found.remarks()
+    return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth, tuple(remarks))
 
 
 def scale_of(drive: RunInputs, config: RunConfig) -> Scale:

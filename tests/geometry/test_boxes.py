@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
-from nolbo_ppl.geometry.boxes import box_area, box_iou, nms, pairwise_iou
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.geometry.boxes import box_area, box_iou, boxes_in_image, nms, pairwise_iou
 
 
 def random_boxes(count: int, seed: int, side: int = 24) -> torch.Tensor:
@@ -84,3 +86,28 @@ def test_nms_keeps_groups_apart() -> None:
 
 def test_nms_of_nothing() -> None:
     assert nms(torch.zeros(0, 4), torch.zeros(0)).tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("box", "expected"),
+    [
+        ([np.nan, 0, 10, 10], "finite x0 y0 x1 y1"),
+        ([0, 0, np.inf, 10], "finite x0 y0 x1 y1"),
+        ([89, 131, 0, 55], "x0 < x1 and y0 < y1; corners"),
+        ([191, 69, 68, 25], "x0 < x1 and y0 < y1; corners"),
+        ([50, 50, 50, 80], "x0 < x1 and y0 < y1"),
+        ([500, 50, 600, 90], "touches the image of 384 x 192 px"),
+        ([0, 0.3, 0.25, 0.7], "at least a pixel each way; boxes are in px"),
+    ],
+)
+def test_given_boxes_are_checked(box: list[float], expected: str) -> None:
+    with pytest.raises(InputError, match=f"box 1 of image 3: got .*expected .*{expected}"):
+        boxes_in_image([[0, 0, 10, 10], box], (384, 192), 3)
+
+
+def test_given_boxes_are_cut_to_the_image() -> None:
+    np.testing.assert_array_equal(boxes_in_image([[-9, 10, 400, 60.5]], (384, 192)), [[0, 10, 384, 60.5]])
+    assert boxes_in_image([], (384, 192)).shape == (0, 4)
+    for wrong in ([1, 2, 3], [[1, 2, 3]], "box", [[1, 2], [3]]):
+        with pytest.raises(InputError, match="boxes of image 0"):
+            boxes_in_image(wrong, (384, 192))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder, read_lengths, read_times
 from nolbo_ppl.data.sequences.opening import open_frames
+from nolbo_ppl.data.sequences.undistorted import UndistortedFrames, guessed_camera, without_distortion
 from nolbo_ppl.data.sequences.video import VideoFile
 from nolbo_ppl.io.camera_files import CameraIntrinsics, read_camera, read_intrinsics, write_camera
 
@@ -12,11 +13,14 @@ __all__ = [
     "FrameSequence",
     "ImageFolder",
     "TumFolder",
+    "UndistortedFrames",
     "VideoFile",
+    "guessed_camera",
     "open_frames",
     "read_camera",
     "read_intrinsics",
     "read_lengths",
     "read_times",
+    "without_distortion",
     "write_camera",
 ]

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.boxes import suppress
+from nolbo_ppl.geometry.boxes import boxes_in_image, suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
 from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer, decode_latents, extents, sampled_shapes
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
@@ -129,13 +129,21 @@ class ObservationModel:
 
         The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation). The
         guide takes its second look at the given box.
+
+        Raises:
+            InputError: boxes that are not finite, not corners in order, outside of their image or less than a pixel wide;
+                names image and box. What sticks out of the image is cut off.
         """
         if len(boxes) != len(images):
             raise input_error("boxes", got=f"{len(boxes)} lists", expected=f"one list for each of {len(images)} images")
         prepared = self._prepare_all(images, intrinsics, size)
+        checked = []
+        for i, (image, given) in enumerate(zip(prepared, boxes)):
+            height, width = image.image.shape[-2:]
+            checked.append(boxes_in_image(given, (round(width / image.scale[0]), round(height / image.scale[1])), i))
 
         def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
-            scaled = [np.asarray(boxes[i], dtype=np.float64).reshape(-1, 4) * np.tile(prepared[i].scale, 2) for i in group]
+            scaled = [checked[i] * np.tile(prepared[i].scale, 2) for i in group]
             row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
             box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
             region = self.model.guide.responsible_region(encoding, row, box)

@@ -15,11 +15,16 @@ from tqdm import tqdm
 from nolbo_ppl.errors import NolboError, input_error
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
 from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.images import is_passed_over
 from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
+from nolbo_ppl.synthetic.assets.obj_file import read_obj
 from nolbo_ppl.synthetic.shapes.canonical_shape import Shape
 
-SUFFIXES = (".off", ".obj", ".ply", ".glb")
+SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
+AXES = dict.fromkeys((".glb", ".gltf"), ("+y", "+z"))
+"""Up and front of files whose format fixes them (glTF 2.0, 3.4 Coordinate System); of others, `DEFAULT_AXES`."""
+DEFAULT_AXES = ("+z", "-y")
 ARCHIVE_FILES = ("meshes.npz", "meta.json", "voxels64.npz")
 ARCHIVE_VOXELS = 64
 BOX_TOLERANCE = 0.03
@@ -30,8 +35,8 @@ def load_cad_folder(
     path: str | os.PathLike[str],
     categories: Collection[str] | None = None,
     *,
-    up: str = "+z",
-    front: str = "-y",
+    up: str | None = None,
+    front: str | None = None,
     max_faces: int | None = 20_000,
     diagonals: Mapping[str, float] | None = None,
 ) -> list[Shape]:
@@ -54,8 +59,9 @@ def load_cad_folder(
     Args:
         path: the folder.
         categories: only these; all by default.
-        up: the axis of the files that points up, e.g. "+y" for GLB by its standard.
-        front: the axis of the files that the front faces, e.g. "+z" for GLB.
+        up: the axis of the files that points up; by default "+y" for GLB and glTF, as their standard has it, else "+z".
+        front: the axis of the files that the front faces; by default "+z" for GLB and glTF, else "-y" for z up and "+z" for
+            y up.
         max_faces: meshes with more faces are simplified by clustering their vertices; None never.
         diagonals: metric box diagonals by category, overriding the table.
 
@@ -65,7 +71,7 @@ def load_cad_folder(
     folder = Path(path)
     if not folder.is_dir():
         raise input_error("no such folder of CAD models", file=folder)
-    turn = axis_rotation(up, front)
+    turns = {suffix: axis_rotation(*axes_of(suffix, up, front)) for suffix in SUFFIXES}
     if max_faces is not None and max_faces < 4:
         raise input_error("max_faces", got=max_faces, expected="at least 4, or None")
     wanted = None if categories is None else set(categories)
@@ -76,7 +82,7 @@ def load_cad_folder(
         shapes = []
         for category, instance, file in tqdm(files, desc="CAD", unit="mesh", disable=None):
             vertices, faces = _read_mesh(file)
-            vertices = vertices @ turn.T
+            vertices = vertices @ turns[file.suffix.lower()].T
             shapes.append(mesh_to_shape(category, instance, vertices, faces, max_faces, diagonals, file=file))
     if not shapes:
         which = "any category" if wanted is None else ", ".join(sorted(wanted))
@@ -87,6 +93,20 @@ def load_cad_folder(
             file=folder,
         )
     return shapes
+
+
+def axes_of(suffix: str, up: str | None = None, front: str | None = None) -> tuple[str, str]:
+    """Up and front of files of this ending: what is asked for, else what their format fixes.
+
+    Example:
+        >>> axes_of(".glb"), axes_of(".obj"), axes_of(".obj", up="+y")
+        (('+y', '+z'), ('+z', '-y'), ('+y', '+z'))
+    """
+    default = AXES.get(suffix, DEFAULT_AXES)
+    up = default[0] if up is None else up if up[:1] in ("+", "-") else f"+{up}"
+    if front is None:
+        front = default[1] if up == default[0] else {"y": "+z", "z": "-y", "x": "-y"}.get(up[1:], default[1])
+    return up, front if front[:1] in ("+", "-") else f"+{front}"
 
 
 def axis_rotation(up: str, front: str) -> Float[np.ndarray, "3 3"]:
@@ -110,6 +130,8 @@ def _list_files(folder: Path) -> list[tuple[str, str, Path]]:
     found: dict[str, tuple[str, str, Path]] = {}
     for file in sorted(folder.rglob("*")):
         if file.suffix.lower() not in SUFFIXES or not file.is_file():
+            continue
+        if any(is_passed_over(Path(part)) for part in file.relative_to(folder).parts):
             continue
         parts = file.relative_to(folder).with_suffix("").parts
         if len(parts) == 1:
@@ -145,6 +167,8 @@ def _split_name(stem: str, file: Path) -> tuple[str, str]:
 
 def _read_mesh(file: Path) -> tuple[Vertices, Faces]:
     """Read one mesh; the parts of a scene are joined in their places. Raises `InputError` naming the file."""
+    if file.suffix.lower() == ".obj":
+        return read_obj(file)
     import trimesh  # delayed: heavy to import
 
     try:

@@ -15,14 +15,18 @@ from nolbo_ppl.data.sequences import (
     ImageFolder,
     TumFolder,
     VideoFile,
+    guessed_camera,
     open_frames,
     read_camera,
     read_intrinsics,
     read_lengths,
     read_times,
+    without_distortion,
     write_camera,
 )
 from nolbo_ppl.errors import InputError
+from nolbo_ppl.geometry.distortion import undistort_image
+from nolbo_ppl.io.images import exif_focal_length
 
 
 def picture(k: int, width: int = 32, height: int = 16) -> np.ndarray:
@@ -294,3 +298,30 @@ def test_intrinsics_of_other_images(tmp_path: Path, values: dict, match: str) ->
     (tmp_path / "k.json").write_text(json.dumps(values))
     with pytest.raises(InputError, match=match):
         read_intrinsics(tmp_path / "k.json", (384, 192))
+
+
+def test_frames_without_the_distortion_of_their_lens(tmp_path: Path) -> None:
+    """Every frame is remapped, the camera of what is returned is a pinhole, names and times stay."""
+    folder_of(tmp_path / "i", ["0.png", "1.png"])
+    (tmp_path / "i" / "times.txt").write_text("0\n0.5\n")
+    lens = CameraIntrinsics(20.0, 20.0, 16.0, 8.0, None, None, "radial-tangential", (0.3, 0.0, 0.0, 0.0))
+    frames, camera = without_distortion(open_frames(tmp_path / "i"), lens)
+    assert not camera.is_distorted and camera.fx > 20 and (camera.width, camera.height) == (32, 16)
+    plain = open_frames(tmp_path / "i")
+    expected = undistort_image(plain.frame(1), lens.vector, "radial-tangential", lens.distortion, camera.vector)
+    np.testing.assert_array_equal(frames.frame(1), expected)
+    assert (frames.frame(1) != plain.frame(1)).any()
+    assert (frames.name(1), frames.time(1), frames.size, len(frames)) == ("1.png", 0.5, (32, 16), 2)
+    same, pinhole = without_distortion(plain, camera)
+    assert same is plain and pinhole is camera
+
+
+def test_a_guessed_camera_says_so(tmp_path: Path) -> None:
+    camera, remark = guessed_camera((640, 480))
+    assert camera.fx == pytest.approx(320 / np.tan(np.radians(30))) and "guessed without any evidence" in remark
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 27
+    Image.fromarray(picture(0)).save(tmp_path / "p.jpg", exif=exif)
+    focal = exif_focal_length(tmp_path / "p.jpg")
+    assert focal == pytest.approx(27 / 36 * 32)
+    assert "EXIF" in guessed_camera((32, 16), focal)[1]

@@ -1,0 +1,83 @@
+"""Frames of a camera with a lens, as a pinhole camera would have taken them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from nolbo_ppl.data.sequences.image_sequence import FrameSequence
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.distortion import undistort_image
+from nolbo_ppl.io.camera_files import CameraIntrinsics
+
+
+class UndistortedFrames(FrameSequence):
+    """A sequence whose frames are undistorted when they are read. `pinhole` is the camera of what is returned."""
+
+    def __init__(self, source: FrameSequence, camera: CameraIntrinsics) -> None:
+        """Frames of `source`, taken by `camera`."""
+        self.source, self.camera, self.path = source, camera, source.path
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    @cached_property
+    def pinhole(self) -> CameraIntrinsics:
+        """The camera of the undistorted frames."""
+        return self.camera.undistorted(self.size)
+
+    def frame(self, k: int, /) -> UInt8[np.ndarray, "h w 3"]:
+        """Frame k in RGB, without the distortion of the lens."""
+        image = self.source.frame(k)
+        if self.camera.model is None:
+            return image
+        return undistort_image(image, self.camera.vector, self.camera.model, self.camera.distortion, self.pinhole.vector)
+
+    def time(self, k: int, /) -> float | None:
+        """Time of frame k in s."""
+        return self.source.time(k)
+
+    def name(self, k: int, /) -> str:
+        """Name of frame k."""
+        return self.source.name(k)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, px."""
+        return self.source.size
+
+    def depth(self, k: int, /) -> Float[np.ndarray, "h w"] | None:
+        """None where there is no depth image. Raises `InputError` where there is one: it fits the distorted frame."""
+        if self.source.depth(k) is not None:
+            raise input_error("depth of a camera with distortion", expected="depth and images that were undistorted together")
+        return None
+
+
+def without_distortion(frames: FrameSequence, camera: CameraIntrinsics) -> tuple[FrameSequence, CameraIntrinsics]:
+    """Frames and camera as they are, or undistorted frames and their pinhole camera where the lens distorts."""
+    if not camera.is_distorted:
+        return frames, camera
+    made = UndistortedFrames(frames, camera)
+    return made, made.pinhole
+
+
+def guessed_camera(size: tuple[int, int], focal: float | None = None) -> tuple[CameraIntrinsics, str]:
+    """A camera for images whose camera nobody knows, and what that means for the figures.
+
+    Args:
+        size: width and height of the images, px.
+        focal: focal length in px, where the images tell it (EXIF); else 60 degrees across are taken for granted.
+    """
+    width, height = size
+    told = focal is not None
+    focal = focal if focal is not None else width / (2 * np.tan(np.pi / 6))
+    across = np.degrees(2 * np.arctan(width / 2 / focal))
+    origin = "from the EXIF focal length" if told else "without any evidence"
+    remark = (
+        f"intrinsics are guessed {origin}: {focal:.0f} px, {across:.0f} degrees across, no distortion; a focal length wrong by "
+        "x % puts every object about x % too near or too far, turns are wrong by as much, and the stated uncertainties know "
+        "nothing of it: calibrate the camera"
+    )
+    return CameraIntrinsics(float(focal), float(focal), width / 2, height / 2, width, height), remark
