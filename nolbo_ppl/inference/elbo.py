@@ -7,7 +7,10 @@ under q(l | I), and the site's own KL is a finite sum.
 
 Names: `objectness`, `shape_kl`, `voxels`, `orientation_kl`, `rotation`, `box_kl`, `box`, `range_kl`, `range`, and where
 they occur `label_kl`, `instance_kl`, `instance_label_kl`. Each is a number in nats whose sum is the bound.
-The inclusive terms are `-KL(p(z | truth) || q(z | I))`, named `<latent>_inclusive`.
+The inclusive terms are `-KL(p(z | truth) || q(z | I))` (the forward KL, as in wake-sleep and amortised inference), named
+`<latent>_inclusive`.
+
+`SceneELBO` is a `pyro.infer.ELBO`: what `TraceMeanField_ELBO` and `TraceEnum_ELBO` do together, with a weight for each term.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ from typing import Any
 import torch
 from pyro import poutine
 from pyro.distributions import TorchDistribution
+from pyro.infer import ELBO
 from pyro.poutine.messenger import Messenger
+from pyro.util import warn_if_nan
 from torch import Tensor
 from torch.distributions import kl_divergence
 
@@ -100,17 +105,33 @@ class ElboResult:
     """Weighted negative sum, divided by the number of scenes."""
 
 
-class SceneELBO:
+class SceneELBO(ELBO):
     """Bound and inclusive terms of a model and guide, through their Pyro traces.
+
+    With the default weights the loss estimates what `Trace_ELBO` estimates, the negative bound summed over a batch, with
+    closed forms in place of samples where there are any. It goes where any bound of Pyro's goes:
+    `SVI(model.story, model.guide, optim, loss=SceneELBO())`, and `SceneELBO()(model.story, model.guide)` is a torch module.
 
     Args:
         weights: weight of each term in the loss, by name (see the module's docstring); others have weight 0.
+        num_particles: runs of guide and model that a loss is the mean of.
+        retain_graph: keep the graph after a backward pass. An `ObservedScene` holds the encoder's graph: with several
+            particles, or for a second step on the same scene, it is needed.
 
     Raises:
-        InputError: a weight has an unknown name or is not a finite number.
+        InputError: a weight has an unknown name or is not a finite number, or there are no particles.
+
+    Example:
+        >>> SceneELBO({"box": 2.0, "box_kl": 1.0}).weights
+        {'box': 2.0, 'box_kl': 1.0}
     """
 
-    def __init__(self, weights: Mapping[str, float] = PURE_BOUND) -> None:
+    def __init__(
+        self, weights: Mapping[str, float] = PURE_BOUND, num_particles: int = 1, retain_graph: bool | None = None
+    ) -> None:
+        super().__init__(num_particles=num_particles, max_plate_nesting=2, retain_graph=retain_graph)
+        if num_particles < 1:
+            raise input_error("num_particles", got=num_particles, expected="at least 1")
         known = {*BOUND_TERMS, *INCLUSIVE_TERMS.values(), *INCLUSIVE_PARTS, SHAPE_LABEL}
         unknown = sorted(set(weights) - known)
         if unknown:
@@ -126,11 +147,11 @@ class SceneELBO:
         """Loss and weighted terms of one run of guide and model.
 
         Args:
-            model: the story, called as `model(*args, **kwargs)`.
-            guide: the guide, called as `guide(*args)`.
+            model: the generative model.
+            guide: its guide.
             *args: what both are run on.
             scenes: number of scenes of the batch; the loss is the mean over scenes.
-            **kwargs: further arguments of the model.
+            **kwargs: further arguments of both.
         """
         terms = self.terms(model, guide, *args, names=set(self.weights), **kwargs)
         total = sum((self.weights[name] * value for name, value in terms.items()), torch.zeros(()))
@@ -147,12 +168,10 @@ class SceneELBO:
         """Terms by name; without `names` those of the pure bound, whose sum is the bound itself.
 
         Raises:
-            NolboError: guide and story do not have the same latent sites.
+            NolboError: guide and model do not have the same latent sites.
         """
         wanted = set(BOUND_TERMS) if names is None else names
-        guide_trace = poutine.trace(poutine.enum(guide, first_available_dim=-3)).get_trace(*args)
-        model_trace = poutine.trace(_Replay(guide_trace)(model)).get_trace(*args, **kwargs)
-        self._check_sites(model_trace, guide_trace)
+        model_trace, guide_trace = self._get_trace(model, guide, args, kwargs)
         enumerated = _enumerated(guide_trace)
         terms: dict[str, Tensor] = {}
         for name, site in model_trace.nodes.items():
@@ -169,15 +188,51 @@ class SceneELBO:
                 kl = _enumerated_kl(site, q) if name in enumerated else kl_divergence(q["fn"], site["fn"])
                 skip = name if name in enumerated else None
                 terms[KL_TERMS[name]] = -_reduce(kl, site, site["mask"], enumerated, skip)
-            mask = site["infer"].get("truth_mask", site["mask"])
-            for part, divergence_to in site["infer"].get("truth_parts", {}).items():
+            mask = site["infer"].get("target_mask", site["mask"])
+            for part, divergence_to in site["infer"].get("target_parts", {}).items():
                 if part in wanted:
                     terms[part] = -_reduce(divergence_to(q["fn"]), site, mask, {})
-            truth = site["infer"].get("truth")
-            if truth is not None and INCLUSIVE_TERMS.get(name) in wanted:
-                divergence = kl_divergence(truth, q["infer"].get("posterior", q["fn"]))
+            target = site["infer"].get("target")
+            if target is not None and INCLUSIVE_TERMS.get(name) in wanted:
+                divergence = kl_divergence(target, q["infer"].get("posterior", q["fn"]))
                 terms[INCLUSIVE_TERMS[name]] = -_reduce(divergence, site, mask, {})
         return terms
+
+    def differentiable_loss(self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, **kwargs: Any) -> Tensor:
+        """The weighted negative sum of the terms, nats summed over the batch, with its graph."""
+        total = torch.zeros(())
+        for _ in range(self.num_particles):
+            total = total + self.evaluate(model, guide, *args, **kwargs).loss / self.num_particles
+        return total
+
+    def loss(self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, **kwargs: Any) -> float:
+        """The same as a number, without gradients."""
+        with torch.no_grad():
+            value = float(self.differentiable_loss(model, guide, *args, **kwargs))
+        warn_if_nan(value, "loss")
+        return value
+
+    def loss_and_grads(self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, **kwargs: Any) -> float:
+        """The loss as a number; its gradients are added to those of the parameters. What `SVI` calls."""
+        total = 0.0
+        for _ in range(self.num_particles):
+            loss = self.evaluate(model, guide, *args, **kwargs).loss / self.num_particles
+            if loss.requires_grad:
+                loss.backward(retain_graph=self.retain_graph)
+            total += float(loss.detach())
+        warn_if_nan(total, "loss")
+        return total
+
+    def _get_trace(
+        self, model: Callable[..., Any], guide: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> tuple[poutine.Trace, poutine.Trace]:
+        """Traces of model and guide, the model run at the guide's values, missing labels enumerated."""
+        guide_trace = poutine.trace(poutine.enum(guide, first_available_dim=-1 - self.max_plate_nesting)).get_trace(
+            *args, **kwargs
+        )
+        model_trace = poutine.trace(_Replay(guide_trace)(model)).get_trace(*args, **kwargs)
+        self._check_sites(model_trace, guide_trace)
+        return model_trace, guide_trace
 
     @staticmethod
     def _check_sites(model_trace: poutine.Trace, guide_trace: poutine.Trace) -> None:
@@ -185,13 +240,13 @@ class SceneELBO:
         guided = {n for n, s in guide_trace.nodes.items() if s["type"] == "sample" and not s["is_observed"]} & set(KL_TERMS)
         if latent != guided:
             raise NolboError(
-                f"story and guide disagree about latent sites: only in the story {sorted(latent - guided)}, "
+                f"model and guide disagree about latent sites: only in the model {sorted(latent - guided)}, "
                 f"only in the guide {sorted(guided - latent)}"
             )
 
 
 class _Replay(Messenger):
-    """Run the story at the guide's values. Pyro's own replay overwrites the story's `infer` (the truths) by the guide's."""
+    """Run the model at the guide's values. Pyro's own replay overwrites the model's `infer` (the targets) by the guide's."""
 
     def __init__(self, guide_trace: poutine.Trace) -> None:
         super().__init__()
@@ -256,7 +311,7 @@ class SceneLoss(torch.nn.Module):
     Args:
         story: the generative model.
         guide: its guide; a module with `observe(batch)`.
-        elbo: the weighted terms.
+        elbo: the weighted terms, the same object that `SVI` takes as its loss.
     """
 
     def __init__(self, story: torch.nn.Module, guide: torch.nn.Module, elbo: SceneELBO) -> None:

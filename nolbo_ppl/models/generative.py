@@ -1,4 +1,4 @@
-"""The generative story of a scene as a Pyro model (NOLBO fig. 2; docs/story.md).
+"""The generative model of a scene in Pyro (NOLBO fig. 2; docs/story.md).
 
 Every region k of a scene has a label: an object's category (and instance), or background. The label throws the
 objectness; an object's label throws the shape latent, which the decoder turns into voxels; its viewpoint throws the
@@ -6,8 +6,9 @@ orientation latent, from which the observed rotation comes; a box and a range la
 without an object contribute their objectness only.
 
 Each latent site carries, where the truth is known in training, its exact posterior given that truth
-(`infer["truth"]`): the target of the inclusive objective. Observed sites that have one carry the closed form of their
-expected log likelihood (`infer["expected_log_prob"]`).
+(`infer["target"]`): the target of the inclusive objective. Observed sites that have one carry the closed form of their
+expected log likelihood (`infer["expected_log_prob"]`). What Pyro makes of models works on this one: `SVI` with the guide,
+`Predictive` (in parallel too), `poutine.uncondition`, `pyro.render_model`.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import world_size
 from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.prior import LabelPrior
+from nolbo_ppl.models.pyro_parameters import declare_parameters
 from nolbo_ppl.models.rotation_term import expected_rotation_log_prob
 from nolbo_ppl.models.scene_batch import SceneBatch, unpack_bits
 from nolbo_ppl.models.shape_networks import VoxelDecoder
@@ -70,7 +72,8 @@ def tilt_kl(truth: ViewpointNormal | ViewpointSinCos, q: dist.TorchDistribution)
 class GenerativeModel(nn.Module):
     """The generative model, owner of the prior networks and of the decoder.
 
-    A plain torch module whose forward makes Pyro statements: its parameters never enter Pyro's global store.
+    A torch module whose forward makes Pyro statements, of its parameters too (`declare_parameters`): an optimiser of
+    Pyro's finds them, and they never enter Pyro's global store.
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -84,9 +87,10 @@ class GenerativeModel(nn.Module):
 
         Args:
             scene: the batch with its responsible regions.
-            decode: at most this many objects are decoded; their voxel term is scaled up to stand for all. None decodes
-                all, 0 none.
+            decode: at most this many objects are decoded, those of the smallest `decode_order` (a random subset); their
+                voxel term is scaled up to stand for all. None decodes all, 0 none.
         """
+        declare_parameters("model", self)
         batch, where, config = scene.batch, scene.assignment, self.config
         scenes = pyro.plate("scenes", where.assigned.shape[0], dim=-2)
         with scenes, pyro.plate("regions", where.is_object.shape[1], dim=-1):
@@ -94,7 +98,7 @@ class GenerativeModel(nn.Module):
             logit = math.log1p(-eps) - math.log(eps)
             prior = Objectness(logits=torch.where(where.is_object, logit, -logit).to(batch.box))
             with poutine.mask(mask=True if where.counted is None else where.counted):
-                pyro.sample("objectness", prior, infer={"truth": prior})
+                pyro.sample("objectness", prior, infer={"target": prior})
         with scenes, pyro.plate("objects", where.assigned.shape[1], dim=-1), poutine.mask(mask=where.assigned):
             latent = shape_site(self.prior, batch, where.assigned)
             self._orientation(batch)
@@ -113,7 +117,7 @@ class GenerativeModel(nn.Module):
                 "azimuth_inclusive": lambda q: kl_divergence(prior, q) - tilt_kl(prior, q),
                 "tilt_inclusive": lambda q: tilt_kl(prior, q),
             }
-            value = pyro.sample("orientation_latent", prior, infer={"truth": prior, "truth_parts": parts})
+            value = pyro.sample("orientation_latent", prior, infer={"target": prior, "target_parts": parts})
             angles = torch.atan2(value[..., 0], value[..., 1]) if config.orientation == "sincos" else value
             kappa = batch.viewpoint.new_tensor(config.rotation_concentration)
             R = viewpoint_to_matrix(batch.viewpoint)
@@ -133,7 +137,7 @@ class GenerativeModel(nn.Module):
             with poutine.mask(mask=where.assigned if mask is None else mask):
                 zero = torch.zeros_like(observed)
                 truth = conjugate_truth(observed, scale)
-                z = pyro.sample(f"{name}_latent", dist.Normal(zero, zero + 1).to_event(1), infer={"truth": truth})
+                z = pyro.sample(f"{name}_latent", dist.Normal(zero, zero + 1).to_event(1), infer={"target": truth})
                 pyro.sample(
                     name,
                     dist.Normal(z, scale).to_event(1),
@@ -146,12 +150,21 @@ class GenerativeModel(nn.Module):
         index = known.flatten().nonzero().squeeze(-1)
         total = len(index)
         if decode is not None and total > decode:
-            index = index[:decode]  # batches come shuffled: the first objects are a random subset
+            index = index[_subset(batch.decode_order, index, decode)]
         if decode == 0 or (len(index) == 0 and world_size() == 1):
             return  # with other processes an empty batch goes through, for their normalisation waits for every one
-        logits = self.decoder(latent.expand(*assigned.shape, -1).flatten(0, 1)[index])
+        latent = latent.expand(*latent.shape[:-3], *assigned.shape, -1).flatten(-3, -2)[..., index, :]
+        logits = self.decoder(latent.flatten(0, -2))
+        if latent.dim() > 2:  # an outer plate, as `Predictive` has in parallel; this site is outside of the plate of scenes
+            logits = logits.unflatten(0, latent.shape[:-1]).unsqueeze(-5)
         observed = unpack_bits(batch.voxels.flatten(0, 1)[index], self.config.voxel_size).to(logits.dtype)
         voxel_site(logits, observed, total / len(index) if len(index) else 1.0)
+
+
+def _subset(order: Tensor | None, index: Tensor, count: int) -> Tensor:
+    """Positions of a random subset of so many objects, in their own order; by torch's generator when none is given."""
+    rank = torch.rand(len(index)) if order is None else order.flatten()[index]
+    return rank.argsort(stable=True)[:count].sort().values
 
 
 def _normal_expectation(observed: Tensor, scale: float) -> Callable[[dist.TorchDistribution], Tensor]:
@@ -169,7 +182,7 @@ def shape_site(prior: LabelPrior, batch: SceneBatch, assigned: Bool[Tensor, "b m
             "label",
             dist.Categorical(logits=batch.box.new_zeros(*missing.shape, prior.labels)),
             obs=None if bool((missing & batch.present).any()) else category,
-            infer={"truth": dist.Delta(category), "truth_mask": assigned & ~missing},
+            infer={"target": dist.Delta(category), "target_mask": assigned & ~missing},
         )
     mean = prior.category_mean()[label]
     latent = pyro.sample(
@@ -200,15 +213,16 @@ def _teacher(batch: SceneBatch, assigned: Tensor, part: slice) -> dict[str, Any]
     if batch.shape_loc is None or batch.shape_scale is None:
         return {}
     truth = dist.Normal(batch.shape_loc[..., part], batch.shape_scale[..., part]).to_event(1)
-    return {"truth": truth, "truth_mask": assigned & batch.has_voxels}
+    return {"target": truth, "target_mask": assigned & batch.has_voxels}
 
 
-def voxel_site(logits: Float[Tensor, "n v v v"], observed: Float[Tensor, "n v v v"], scale: float = 1.0) -> None:
+def voxel_site(logits: Float[Tensor, "*draws n v v v"], observed: Float[Tensor, "n v v v"], scale: float = 1.0) -> None:
     """Voxels of n decoded objects, independent Bernoulli; `scale` makes a subset stand for all."""
-    if len(logits) == 0:  # Pyro has no empty plates; the site keeps the decoder in the graph (see `Story._voxels`)
+    count = logits.shape[-4]
+    if count == 0:  # Pyro has no empty plates; the site keeps the decoder in the graph (see `GenerativeModel._voxels`)
         pyro.sample("voxels", dist.Bernoulli(logits=logits.flatten(), validate_args=False), obs=observed.flatten())
         return
-    with pyro.plate("decoded", len(logits), dim=-1), poutine.scale(scale=scale):
+    with pyro.plate("decoded", count, dim=-1), poutine.scale(scale=scale):
         pyro.sample("voxels", dist.Bernoulli(logits=logits, validate_args=False).to_event(3), obs=observed)
 
 

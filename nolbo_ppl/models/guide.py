@@ -23,6 +23,7 @@ from nolbo_ppl.models.head import RegionHead
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
+from nolbo_ppl.models.pyro_parameters import declare_parameters
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
 
 
@@ -44,7 +45,12 @@ def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> 
 
 
 class Guide(nn.Module):
-    """Encoder and head, and the Pyro guide they amortise."""
+    """Encoder and head, and the Pyro guide they amortise.
+
+    A region is responsible for one object: where a cell holds more objects than predictors, those of the worst overlap
+    find none. Their regions count as background and their other terms are masked (`ObservedScene.left_out`; validation
+    reports their share).
+    """
 
     def __init__(self, config: ModelConfig, prior: LabelPrior) -> None:
         super().__init__()
@@ -163,12 +169,20 @@ class Guide(nn.Module):
         own = decode_box(q.box_loc, region // p, columns, self.config).unflatten(0, (-1, p))
         return cell * p + box_iou(own, box[:, None]).argmax(-1)
 
-    def forward(self, scene: ObservedScene) -> None:
-        """The Pyro guide: the sites of `Story`, amortised."""
+    def forward(self, scene: ObservedScene, decode: int | None = None) -> None:
+        """The Pyro guide: the latent sites of `GenerativeModel`, amortised.
+
+        Args:
+            scene: the batch as `observe` encoded it, anew for each step of an optimiser.
+            decode: an argument of the generative model; the guide decodes nothing.
+        """
+        declare_parameters("guide", self)
         batch, q, assigned = scene.batch, scene.posterior, scene.assignment.assigned
         scenes = pyro.plate("scenes", assigned.shape[0], dim=-2)
+        counted = scene.assignment.counted
         with scenes, pyro.plate("regions", scene.encoding.objectness_logit.shape[1], dim=-1):
-            pyro.sample("objectness", Objectness(logits=scene.encoding.objectness_logit))
+            with poutine.mask(mask=True if counted is None else counted):
+                pyro.sample("objectness", Objectness(logits=scene.encoding.objectness_logit))
         with scenes, pyro.plate("objects", assigned.shape[1], dim=-1), poutine.mask(mask=assigned):
             label = self._label(batch, q)
             latent = self._prior().category_dim

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch
@@ -85,3 +85,8 @@ class ObservedScene:
     encoding: Encoding
     assignment: Assignment
     posterior: RegionParameters
+
+    @property
+    def left_out(self) -> Bool[Tensor, "b m"]:
+        """Objects that no region is responsible for: their cell has more objects than predictors."""
+        return self.batch.present & ~self.assignment.assigned

@@ -62,6 +62,9 @@ class SceneBatch:
     """Categories of which every instance in the image is labelled; all of them when it is not given."""
     noise: Float[Tensor, "b m d"] | None = None
     """Standard normal noise of the shape latent's sample; drawn from torch's generator when it is not given."""
+    decode_order: Float[Tensor, "b m"] | None = None
+    """Random numbers: where only some objects are decoded, those of the smallest are; drawn from torch's generator when they
+    are not given."""
 
     def replace(self, **changes: Any) -> SceneBatch:
         """A copy with other fields."""

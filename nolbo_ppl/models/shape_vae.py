@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from nolbo_ppl.models.distributions import NoisyNormal
 from nolbo_ppl.models.generative import GenerativeModel, voxel_site
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.pyro_parameters import declare_parameters
 from nolbo_ppl.models.scene_batch import unpack_bits
 from nolbo_ppl.models.shape_networks import VoxelEncoder
 
@@ -40,6 +41,7 @@ class ShapeStory(nn.Module):
 
     def forward(self, batch: ShapeBatch) -> None:
         """p(z | l) p(voxels | z) of each shape; an instance of -1 is "novel" here, the prior's zero mean."""
+        declare_parameters("model", self.story)
         prior, size = self.story.prior, self.story.config.voxel_size
         with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(batch.voxels), dim=-1):
             mean = prior.category_mean()[batch.category][None]
@@ -69,6 +71,7 @@ class ShapeGuide(nn.Module):
 
     def forward(self, batch: ShapeBatch) -> None:
         """The Pyro guide of `ShapeStory`."""
+        declare_parameters("guide", self)
         loc, scale = self.posterior(batch.voxels)
         noise = None if batch.noise is None else batch.noise[None]
         with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(loc), dim=-1):

@@ -20,7 +20,7 @@ from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
-from nolbo_ppl.training.stages import seeded_noise
+from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
 
 
 def to_batch(arrays: Arrays) -> SceneBatch:
@@ -213,7 +213,8 @@ class SceneSupply:
             seeds = generator.integers(2**63, size=self.batch_size)[self.part]
             batch = augment(batch, self.augmentation, seeds, size)
         noise = seeded_noise(self.seed, step, self.batch_size, batch.box.shape[1], self.latent_dim)
-        return batch.replace(noise=noise[self.part])
+        order = seeded_noise(self.seed, step + DECODE_STREAM, self.batch_size, batch.box.shape[1])
+        return batch.replace(noise=noise[self.part], decode_order=order[self.part])
 
     def prepared(self, index: Int[np.ndarray, " b"]) -> SceneBatch:
         """Scenes of these numbers without augmentation, with the teacher's latents."""

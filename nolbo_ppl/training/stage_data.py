@@ -22,7 +22,7 @@ from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
 from nolbo_ppl.training.scene_supply import JoinedScenes, MixedSupply, SceneSubset, SceneSupply, ShapeTable
-from nolbo_ppl.training.stages import seeded_noise
+from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
 from nolbo_ppl.training.train_config import TrainConfig
 
 VALIDATION_SEED = 1000
@@ -192,7 +192,10 @@ class TrainingData:
             step = 64 if self.model.image_size <= 256 else 16
             for first in range(0, total, step):
                 batch = supply.prepared(np.arange(first, min(first + step, total)))
-                yield batch.replace(noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim))
+                yield batch.replace(
+                    noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim),
+                    decode_order=seeded_noise(0, first + DECODE_STREAM, *batch.present.shape),
+                )
 
     def teach(self, model: Nolbo) -> None:
         """Encode the shapes by the trained shape guide, in full precision."""

@@ -21,6 +21,9 @@ from nolbo_ppl.models.shape_vae import ShapeBatch
 OBJECTIVES: dict[str, Mapping[str, float]] = {"inclusive": INCLUSIVE, "elbo": PURE_BOUND, "paper": PAPER}
 """Weights of the terms by the name of the objective."""
 
+DECODE_STREAM = 2**40
+"""Added to a step's number, it gives the random numbers that choose which objects are decoded."""
+
 
 @dataclass(frozen=True)
 class TrainingStage:

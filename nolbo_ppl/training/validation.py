@@ -24,16 +24,17 @@ def held_out(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
     (`inclusive/...`, nats a scene), and at the regions responsible for the true objects: `box50` (share of boxes with
     IoU of at least 0.5), `category` (accuracy by maximum likelihood over the prior means), `acc_pi6` and
     `med_err_deg` (objects of categories without declared symmetry), `azimuth_in_90` (share of true azimuths inside the
-    90 % region).
+    90 % region). `left_out` is the share of objects that no region is responsible for.
     """
     training = [module for module in model.modules() if module.training]  # a frozen part stays in evaluation mode
     model.eval()
     sums: dict[str, float] = {}
-    scenes = 0
+    scenes = objects = left_out = 0
     found: dict[str, list[torch.Tensor]] = {name: [] for name in ("box50", "category", "error", "region")}
     for batch in batches:
         scene = model.guide.observe(batch)
         scenes += len(batch.image)
+        objects, left_out = objects + int(batch.present.sum()), left_out + int(scene.left_out.sum())
         for prefix, weights in (("bound", PURE_BOUND), ("inclusive", INCLUSIVE)):
             terms = SceneELBO(weights).evaluate(model.story, model.guide, scene, decode=decode).terms
             for name, value in terms.items():
@@ -43,6 +44,7 @@ def held_out(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
     for module in training:
         module.training = True
     result = {name: value / max(scenes, 1) for name, value in sums.items()}
+    result["left_out"] = left_out / max(objects, 1)
     result["bound"] = sum(value for name, value in result.items() if name.startswith("bound/"))
     stacked = {name: torch.cat(values) if values else torch.zeros(0) for name, values in found.items()}
     error = stacked.pop("error")

@@ -66,7 +66,7 @@ def test_truth_of_a_conjugate_site_is_its_posterior() -> None:
     scene = observed_scene(config, random_batch(config))
     trace = trace_of(config, scene, decode=0)
     for name, scale in (("box", config.box_scale), ("range", config.range_scale)):
-        truth = trace.nodes[f"{name}_latent"]["infer"]["truth"]
+        truth = trace.nodes[f"{name}_latent"]["infer"]["target"]
         observed = trace.nodes[name]["value"]
         precision = 1 + scale**-2
         torch.testing.assert_close(truth.mean, observed * scale**-2 / precision)

@@ -11,6 +11,7 @@ from nolbo_ppl.models.distributions.bernoulli import (
     objectness_kl_inclusive,
     objectness_prior,
 )
+from nolbo_ppl.models.distributions.circular import circular
 from nolbo_ppl.models.distributions.gaussian_mixture import (
     component_log_prob,
     enumerated_kl,
@@ -34,13 +35,14 @@ from nolbo_ppl.models.distributions.viewpoint import ViewpointMixture, Viewpoint
 from nolbo_ppl.models.distributions.viewpoint_kl import kl_sincos_to_sincos
 from nolbo_ppl.models.distributions.viewpoint_sincos import ViewpointSinCos
 from nolbo_ppl.models.distributions.von_mises import MAX_CONCENTRATION, VonMisesMixture
-from nolbo_ppl.models.distributions.von_mises_kl import kl_mixture_to_wrapped, kl_wrapped_to_mixture
+from nolbo_ppl.models.distributions.von_mises_kl import kl_mixture_to_mixture, kl_mixture_to_wrapped, kl_wrapped_to_mixture
 from nolbo_ppl.models.distributions.wrapped_normal import (
     TrigonometricMoments,
     WrappedNormal,
     kl_of_angles,
     wrapped_normal_moments,
 )
+from nolbo_ppl.models.distributions.wrapped_normal_kl import wrapped_normal_kl
 
 __all__ = [
     "LOG_HAAR_VOLUME",
@@ -57,10 +59,12 @@ __all__ = [
     "VonMisesMixture",
     "WrappedNormal",
     "bernoulli_entropy",
+    "circular",
     "component_log_prob",
     "concentration_to_scale",
     "enumerated_kl",
     "gaussian_mixture_log_prob",
+    "kl_mixture_to_mixture",
     "kl_mixture_to_wrapped",
     "kl_of_angles",
     "kl_sincos_to_sincos",
@@ -77,5 +81,6 @@ __all__ = [
     "rotation_constraint",
     "scale_to_concentration",
     "sincos_to_angle",
+    "wrapped_normal_kl",
     "wrapped_normal_moments",
 ]

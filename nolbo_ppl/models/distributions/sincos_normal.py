@@ -87,25 +87,33 @@ class SinCosNormal(TorchDistribution):
         """E[sin], E[cos] of a sample projected to the circle by `sincos_to_angle`, the one a rotation is built from.
 
         It differs from `mean` by the order of the variance: at 45 degrees the errors of sine and cosine, independent
-        here, spread the angle half as far as the angle's own. With `w` the cross product of the direction (sin v, cos v)
+        here, spread the angle half as far as the angle's own. Trapezoidal rule about the mean's direction, over ten scales
+        or the whole circle, whichever is shorter.
+        """
+        half_width = (10 * self.scale).clamp_max(math.pi)
+        grid = torch.arange(nodes, dtype=self.loc.dtype, device=self.loc.device) * (2 / nodes) - 1
+        angle = self.loc + half_width * grid.reshape((-1,) + (1,) * self.loc.dim())
+        weight = torch.softmax(self.projected_log_density(angle), 0)
+        return torch.stack(((weight * torch.sin(angle)).sum(0), (weight * torch.cos(angle)).sum(0)), -1)
+
+    def projected_log_density(self, angle: Float[Tensor, "*value"]) -> Float[Tensor, "*shape"]:
+        """Log density in nats per rad of the angle of a sample.
+
+        With `w` the cross product of the direction (sin v, cos v)
         and the mean m, `V = Var[cos] sin^2 v + Var[sin] cos^2 v` and `D` the mean's length along v in standard
         deviations, the angle has density `sqrt(|S|) / (2 pi V) (exp(-m' S^-1 m / 2) + sqrt(2 pi) D Phi(D)
-        exp(-w^2 / (2 V)))` (projected normal: Mardia & Jupp, section 3.5.6); trapezoidal rule about the mean's
-        direction, over ten scales or the whole circle, whichever is shorter.
+        exp(-w^2 / (2 V)))` (projected normal: Mardia & Jupp, section 3.5.6).
         """
         moments = wrapped_normal_moments(self.loc, self.scale)
-        (m_s, m_c), (v_s, v_c) = moments.mean[..., None].unbind(-2), moments.variance[..., None].unbind(-2)
-        half_width = (10 * self.scale).clamp_max(math.pi)[..., None]
-        grid = torch.arange(nodes, dtype=self.loc.dtype, device=self.loc.device) * (2 / nodes) - 1
-        angle = self.loc[..., None] + half_width * grid
+        (m_s, m_c), (v_s, v_c) = moments.mean.unbind(-1), moments.variance.unbind(-1)
         sine, cosine = torch.sin(angle), torch.cos(angle)
         V = v_c * sine * sine + v_s * cosine * cosine
         D = (m_s * v_c * sine + m_c * v_s * cosine) / torch.sqrt(v_s * v_c * V)
         across = torch.square(sine * m_c - cosine * m_s) / V
         near = torch.exp(-0.5 * (m_s * m_s / v_s + m_c * m_c / v_c))
         density = (near + math.sqrt(2 * math.pi) * D * torch.special.ndtr(D) * torch.exp(-0.5 * across)) / V
-        weight = density / density.sum(-1, keepdim=True)
-        return torch.stack(((weight * sine).sum(-1), (weight * cosine).sum(-1)), -1)
+        tiny = torch.finfo(density.dtype).tiny  # far out a direction's density underflows, its logarithm must not
+        return torch.log(density.clamp_min(tiny)) + 0.5 * torch.log(v_s * v_c) - math.log(2 * math.pi)
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Differential entropy in nats."""

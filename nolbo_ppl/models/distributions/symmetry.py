@@ -8,6 +8,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nolbo_ppl.errors import input_error
+
+
+def check_order(order: Tensor) -> None:
+    """Orders are counts. Raises `InputError` for floats and for booleans, whose True would mean "no symmetry"."""
+    if order.dtype.is_floating_point or order.dtype.is_complex or order.dtype == torch.bool:
+        raise input_error("an order of symmetry that is no integer", got=order.dtype, expected="an int tensor")
+
 
 def group_angles(
     order: Int[Tensor, "*batch"], dtype: torch.dtype

@@ -15,11 +15,13 @@ from torch.distributions.utils import broadcast_all
 from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import viewpoint_moments_to_matrix, wrap_angle
-from nolbo_ppl.models.distributions.von_mises import MAX_CONCENTRATION, VonMisesMixture
+from nolbo_ppl.models.distributions.circular import circular
+from nolbo_ppl.models.distributions.symmetry import check_order
+from nolbo_ppl.models.distributions.von_mises import VonMisesMixture
 from nolbo_ppl.models.distributions.wrapped_normal import WrappedNormal
 
 _EVENT = torch.Size((3,))
-_support = constraints.independent(constraints.interval(-math.pi, math.pi), 1)
+_support = constraints.independent(circular, 1)
 
 
 class ViewpointNormal(TorchDistribution):
@@ -51,6 +53,7 @@ class ViewpointNormal(TorchDistribution):
         self.loc, self.scale = broadcast_all(loc, scale)
         batch_shape = self.loc.shape[:-1]
         if order is not None:
+            check_order(order)
             batch_shape = torch.broadcast_shapes(batch_shape, order.shape)
             self.loc, self.scale = self.loc.expand(*batch_shape, 3), self.scale.expand(*batch_shape, 3)
             order = order.expand(batch_shape)
@@ -144,7 +147,7 @@ class ViewpointMixture(TorchDistribution):
         natural: their natural parameters `kappa (cos, sin)`.
         elevation_inplane_loc: mean elevation and in-plane rotation in rad.
         elevation_inplane_scale: their standard deviations in rad.
-        max_concentration: limit of kappa, see `VonMisesMixture`.
+        max_concentration: limit of kappa, None for none, see `VonMisesMixture`.
 
     Why: docs/bound.md (the inclusive objective).
     """
@@ -164,7 +167,7 @@ class ViewpointMixture(TorchDistribution):
         natural: Float[Tensor, "*#batch K 2"],
         elevation_inplane_loc: Float[Tensor, "*#batch 2"],
         elevation_inplane_scale: Float[Tensor, "*#batch 2"],
-        max_concentration: float = MAX_CONCENTRATION,
+        max_concentration: float | None = None,
         validate_args: bool | None = None,
     ) -> None:
         loc, scale = broadcast_all(elevation_inplane_loc, elevation_inplane_scale)

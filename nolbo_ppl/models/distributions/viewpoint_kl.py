@@ -8,24 +8,25 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import kl_divergence
 from torch.distributions.kl import register_kl
 
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.distributions.sincos_normal import SinCosNormal
 from nolbo_ppl.models.distributions.symmetry import group_angles
 from nolbo_ppl.models.distributions.viewpoint import ViewpointMixture, ViewpointNormal
 from nolbo_ppl.models.distributions.viewpoint_sincos import ViewpointSinCos
 from nolbo_ppl.models.distributions.von_mises_kl import kl_mixture_to_wrapped, kl_wrapped_to_mixture
-from nolbo_ppl.models.distributions.wrapped_normal import kl_of_angles
+from nolbo_ppl.models.distributions.wrapped_normal import WrappedNormal
+from nolbo_ppl.models.distributions.wrapped_normal_kl import wrapped_normal_kl
 
 
 def _elevation_inplane_kl(loc_q: Tensor, scale_q: Tensor, loc_p: Tensor, scale_p: Tensor) -> Tensor:
-    return kl_of_angles(loc_q, scale_q, loc_p, scale_p).sum(-1)
+    q, p = WrappedNormal(loc_q, scale_q, validate_args=False), WrappedNormal(loc_p, scale_p, validate_args=False)
+    return wrapped_normal_kl(q, p).sum(-1)
 
 
 @register_kl(ViewpointNormal, ViewpointMixture)
@@ -46,18 +47,19 @@ def kl_mixture_to_normal(q: ViewpointMixture, p: ViewpointNormal) -> Float[Tenso
 
 @register_kl(ViewpointNormal, ViewpointNormal)
 def kl_normal_to_normal(a: ViewpointNormal, b: ViewpointNormal) -> Float[Tensor, "*batch"]:
-    """KL(a || b) in nats in the isotropic angle form; the symmetry of a makes it inclusive, of b alone exclusive.
+    """KL(a || b) in nats, exact; the symmetry of a makes it inclusive, of b alone exclusive.
 
-    With n-fold symmetry the difference in azimuth is wrapped to the period 2 pi / n, a bound from above. Exclusive adds
-    log n, the price of the mixture's other modes, on which a guide with one mode puts nothing.
+    Exclusive pays log n for the mixture's other modes, on which a narrow guide with one mode puts nothing.
+
+    Raises:
+        InputError: both have a symmetry, and not the same.
     """
     order = a.order if a.order is not None else b.order
     if order is None:
-        return kl_of_angles(a.loc, a.scale, b.loc, b.scale).sum(-1)
-    count = order.clamp_min(1).to(a.loc.dtype)
-    azimuth = kl_of_angles(a.loc[..., 0], a.scale[..., 0], b.loc[..., 0], b.scale[..., 0], 2 * math.pi / count)
-    if a.order is None:
-        azimuth = azimuth + torch.log(count)
+        return wrapped_normal_kl(a.angles, b.angles).sum(-1)
+    if a.order is not None and b.order is not None and not bool((a.order == b.order).all()):
+        raise input_error("KL of viewpoints of different symmetries", got=(a.order, b.order), expected="the same order")
+    azimuth = wrapped_normal_kl(a.azimuth, b.azimuth, order, quotient=a.order is not None)
     azimuth = torch.where(order == 0, torch.zeros_like(azimuth), azimuth)
     return azimuth + _elevation_inplane_kl(a.loc[..., 1:], a.scale[..., 1:], b.loc[..., 1:], b.scale[..., 1:])
 

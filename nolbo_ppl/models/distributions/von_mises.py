@@ -15,17 +15,19 @@ from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import wrap_angle
 from nolbo_ppl.models.distributions.bessel import bessel_ratio_over_x, log_i0e
+from nolbo_ppl.models.distributions.circular import circular
 from nolbo_ppl.models.distributions.symmetry import group_angles
 
 MAX_CONCENTRATION = 300.0
-"""Default limit of a component's concentration: a standard deviation of 3.3 degrees."""
+"""The guide's limit of a component's concentration: a standard deviation of 3.3 degrees."""
 
 
 class _LimitNorm(torch.autograd.Function):
-    """Scale vectors longer than the limit back to it, with the projected gradient of a minimised loss.
+    """Scale vectors longer than the limit back to it, with the projected gradient of a minimised loss, for training alone.
 
     The exact gradient of the clamp has no radial part beyond the limit, so a component that once passed it could never
     soften again; the identity's would let it drift away. Here the radial part passes when descent shortens the vector.
+    It is no function's gradient: a sampler that follows gradients (HMC, NUTS) needs a mixture without a limit.
     """
 
     @staticmethod
@@ -64,7 +66,9 @@ class VonMisesMixture(TorchDistribution):
         logits: unnormalised log weights of the components.
         natural: natural parameters `kappa (cos mu, sin mu)` of each; no angle has to be regressed, and a component
             passes through uniform (zero) when it changes sides.
-        max_concentration: components with a larger kappa are limited to it, see `_LimitNorm`.
+        max_concentration: None takes every kappa as it is, with exact gradients. A number limits larger ones to it, which
+            keeps a network's densities from collapsing; beyond it the gradient in `natural` is the projected one of a
+            descent, not the function's (see `_LimitNorm`).
 
     `q(v) = sum_k w_k exp(natural_k . (cos v, sin v)) / (2 pi I0(kappa_k))`. Mardia & Jupp, sections 3.5.4 and 5.5.
     """
@@ -73,26 +77,26 @@ class VonMisesMixture(TorchDistribution):
         "logits": constraints.independent(constraints.real, 1),
         "natural": constraints.independent(constraints.real, 2),
     }
-    support = constraints.interval(-math.pi, math.pi)
+    support = circular
     has_rsample = False
 
     def __init__(
         self,
         logits: Float[Tensor, "*#batch K"],
         natural: Float[Tensor, "*#batch K 2"],
-        max_concentration: float = MAX_CONCENTRATION,
+        max_concentration: float | None = None,
         validate_args: bool | None = None,
     ) -> None:
         shape = torch.broadcast_shapes(logits.shape, natural.shape[:-1])
         self.logits = logits.expand(shape)
         self.natural = natural.expand(*shape, 2)
-        self.max_concentration = float(max_concentration)
+        self.max_concentration = None if max_concentration is None else float(max_concentration)
         self._derive()
         super().__init__(shape[:-1], validate_args=validate_args)
 
     def _derive(self) -> None:
         """Log weights, means as unit vectors, concentrations and log coefficients of the components."""
-        limited = _LimitNorm.apply(self.natural, self.max_concentration)
+        limited = self.natural if self.max_concentration is None else _LimitNorm.apply(self.natural, self.max_concentration)
         # The floor keeps the direction of a uniform component, 0 / 0, and its gradient finite.
         floor = 1e-30 if limited.dtype == torch.float64 else 1e-20
         self.concentration = torch.sqrt((limited * limited).sum(-1) + floor)
@@ -107,7 +111,7 @@ class VonMisesMixture(TorchDistribution):
         logits: Float[Tensor, "*#batch K"],
         mean: Float[Tensor, "*#batch K"],
         concentration: Float[Tensor, "*#batch K"],
-        max_concentration: float = MAX_CONCENTRATION,
+        max_concentration: float | None = None,
     ) -> VonMisesMixture:
         """The mixture with components of the given mean directions (rad) and concentrations."""
         natural = concentration[..., None] * torch.stack((torch.cos(mean), torch.sin(mean)), -1)
@@ -125,6 +129,13 @@ class VonMisesMixture(TorchDistribution):
         super(VonMisesMixture, new).__init__(batch_shape, validate_args=False)
         new._validate_args = self._validate_args
         return new
+
+    @property
+    def largest_concentration(self) -> float:
+        """The limit of kappa, or the largest there is: what quadrature has to resolve."""
+        if self.max_concentration is not None:
+            return self.max_concentration
+        return float(self.concentration.detach().max()) if self.concentration.numel() else 0.0
 
     @property
     def weights(self) -> Float[Tensor, "*batch K"]:
@@ -249,7 +260,7 @@ class VonMisesMixture(TorchDistribution):
 
     def entropy(self, nodes: int | None = None) -> Float[Tensor, "*batch"]:
         """Differential entropy in nats by the periodic trapezoidal rule (node count: `default_nodes`)."""
-        nodes = nodes or default_nodes(self.max_concentration, self.natural.dtype)
+        nodes = nodes or default_nodes(self.largest_concentration, self.natural.dtype)
         log_density = self.log_density(_circle(nodes, self.natural).reshape((-1,) + (1,) * len(self.batch_shape)))
         return -(log_density.exp() * log_density).sum(0) * (2 * math.pi / nodes)
 
@@ -260,10 +271,10 @@ class VonMisesMixture(TorchDistribution):
 
         `value` is inside the highest-density region of probability c exactly where this is at most c, so over truths
         drawn from the density it is uniform: the test of calibration. Order 0 gives zero. Not differentiated; the
-        level set is cut linearly between `64 sqrt(max_concentration)` nodes: wrong by at most 2e-3 at the very top of a
+        level set is cut linearly between `64 sqrt(largest concentration)` nodes: wrong by at most 2e-3 at the very top of a
         narrow mode, by 2e-4 elsewhere.
         """
-        nodes = nodes or 64 * math.ceil(math.sqrt(self.max_concentration))
+        nodes = nodes or 64 * math.ceil(math.sqrt(max(self.largest_concentration, 1.0)))
         with torch.no_grad():
             order = torch.as_tensor(order, device=self.natural.device)
             coefficients = self.folded(order)

@@ -11,11 +11,11 @@ from jaxtyping import Float
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
-from torch.distributions.kl import register_kl
 from torch.distributions.utils import broadcast_all
 from torch.types import _size
 
 from nolbo_ppl.geometry.rotation import wrap_angle
+from nolbo_ppl.models.distributions.circular import circular
 
 _WIDE = 1.5
 """Scale in rad from which the Fourier series is used: on both sides of it 5 wraps or 6 harmonics reach 1e-17."""
@@ -61,7 +61,7 @@ class WrappedNormal(TorchDistribution):
     """
 
     arg_constraints: ClassVar = {"loc": constraints.real, "scale": constraints.positive}
-    support = constraints.interval(-math.pi, math.pi)
+    support = circular
     has_rsample = True
 
     def __init__(
@@ -155,17 +155,13 @@ def kl_of_angles(
 ) -> Float[Tensor, "*batch"]:
     """KL in nats of two normals of angles whose means differ by the shortest way round (isotropic angle form).
 
-    An upper bound of the KL of the wrapped distributions: wrapping is a map, and maps only lose information (data
-    processing), whichever representative of the mean is taken before wrapping; the shortest way gives the smallest of
-    these bounds. An evidence bound that uses it therefore stays a bound. It is tight for scales small beside the
-    period. Why on the angle: docs/bound.md, "One error, one price".
+    An upper bound of the KL of the wrapped distributions, which is `wrapped_normal_kl`: wrapping is a map, and maps only
+    lose information (data processing), whichever representative of the mean is taken before wrapping; the shortest way
+    gives the smallest of these bounds. It is tight for scales small beside the period, and far off for wide ones: scales
+    of 5 rad, 3 rad apart, give 0.18 nats for two densities that are both uniform. Why on the angle: docs/bound.md, "One
+    error, one price".
     """
     turned = torch.remainder(loc_q - loc_p + period / 2, period) - period / 2
     ratio = scale_q / scale_p
     shift = turned / scale_p
     return 0.5 * (ratio * ratio + shift * shift - 1) - torch.log(ratio)
-
-
-@register_kl(WrappedNormal, WrappedNormal)
-def _kl_wrapped_wrapped(q: WrappedNormal, p: WrappedNormal) -> Tensor:
-    return kl_of_angles(q.loc, q.scale, p.loc, p.scale)

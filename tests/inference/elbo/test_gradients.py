@@ -95,7 +95,7 @@ def test_bad_weights(weights: dict[str, float], message: str) -> None:
 
 @pytest.mark.parametrize(
     ("hide_in", "message"),
-    [("guide", r"only in the story \['box_latent'\]"), ("story", r"only in the guide \['box_latent'\]")],
+    [("guide", r"only in the model \['box_latent'\]"), ("story", r"only in the guide \['box_latent'\]")],
 )
 def test_disagreeing_sites(hide_in: str, message: str) -> None:
     config = tiny_config()

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.distributions import kl_divergence
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import symmetry_rotations
@@ -98,6 +99,25 @@ def test_samples(random_rotations, assert_mean, so3_grid) -> None:
     log_prob = p.log_prob(grid[:, None])
     entropy = -(weight[:, None] * log_prob.exp() * log_prob).sum(0)
     assert_mean(-p.log_prob(R), entropy)
+    torch.testing.assert_close(p.entropy(), entropy, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.7, 15.0, 200.0, 5e4])
+def test_entropy_by_quadrature(kappa, assert_mean) -> None:
+    """That of the matrix Fisher without a symmetry, samples with one; log n less where the modes are apart."""
+    p = SymmetricMatrixFisher(torch.eye(3), torch.tensor(kappa), ORDERS)
+    entropy = p.entropy()
+    torch.testing.assert_close(entropy[0], MatrixFisher(torch.eye(3), kappa).entropy(), rtol=0, atol=1e-8)
+    assert_mean(-p.log_prob(p.sample((4000,))), entropy, extra=1e-9)
+    if kappa >= 200:
+        torch.testing.assert_close(entropy[1:4] - entropy[0], torch.tensor([2.0, 3.0, 4.0]).log(), rtol=0, atol=1e-6)
+
+
+def test_divergences_without_a_form_say_so() -> None:
+    one, many = MatrixFisher(torch.eye(3), 3.0), SymmetricMatrixFisher(torch.eye(3), 3.0, 2)
+    for p, q in ((one, many), (many, one), (many, many)):
+        with pytest.raises(NotImplementedError, match="expected_log_prob"):
+            kl_divergence(p, q)
 
 
 def test_gradients(random_rotations) -> None:
@@ -127,5 +147,7 @@ def test_single_precision(random_rotations) -> None:
 def test_orders_are_checked() -> None:
     with pytest.raises(InputError, match="order of symmetry"):
         SymmetricMatrixFisher(torch.eye(3), 1.0, torch.tensor(1.0))
+    with pytest.raises(InputError, match=r"order of symmetry that is no integer: got torch\.bool"):
+        SymmetricMatrixFisher(torch.eye(3), 1.0, torch.tensor(True))
     with pytest.raises(ValueError, match="order"):
         SymmetricMatrixFisher(torch.eye(3), 1.0, torch.tensor(-1), validate_args=True)

@@ -124,7 +124,8 @@ def test_mode_is_the_highest_density(seed) -> None:
     generator = torch.Generator().manual_seed(seed)
     logits = torch.randn(4, generator=generator, dtype=torch.float64)
     spread = 10 ** (3 * torch.rand(1, generator=generator, dtype=torch.float64) - 0.5)
-    q = VonMisesMixture(logits, spread * torch.randn(4, 2, generator=generator, dtype=torch.float64))
+    natural = spread * torch.randn(4, 2, generator=generator, dtype=torch.float64)
+    q = VonMisesMixture(logits, natural, max_concentration=300.0)
     grid = torch.arange(50_000, dtype=torch.float64) * (2 * math.pi / 50_000) - math.pi
     best = q.log_prob(grid).max()
     found = q.log_prob(q.mode)
@@ -177,6 +178,16 @@ def test_gradients_below_the_limit() -> None:
     assert check(lambda a, b: VonMisesMixture(a, b).mean_direction(), (logits, natural))
     assert check(lambda a, b: VonMisesMixture(a, b).entropy(), (logits, natural))
     assert check(lambda a, b: VonMisesMixture(a, b).circular_std, (logits, natural))
+
+
+def test_no_limit_unless_one_is_given() -> None:
+    """Every kappa is what it was given as, and its gradient the function's own; ends of the scale included."""
+    q = VonMisesMixture.from_mean_concentration(torch.zeros(2), torch.zeros(2), torch.tensor([1e4, 1e-3]))
+    torch.testing.assert_close(q.concentration, torch.tensor([1e4, 1e-3]))
+    natural = torch.tensor([[400.0, 300.0]], requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x: VonMisesMixture(torch.zeros(1), x).log_prob(torch.tensor(0.7)), natural, eps=1e-3, atol=1e-5
+    )
 
 
 def test_concentration_is_limited_and_can_come_back() -> None:
