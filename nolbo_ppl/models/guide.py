@@ -179,10 +179,10 @@ class Guide(nn.Module):
         declare_parameters("guide", self)
         batch, q, assigned = scene.batch, scene.posterior, scene.assignment.assigned
         scenes = pyro.plate("scenes", assigned.shape[0], dim=-2)
-        counted = scene.assignment.counted
-        with scenes, pyro.plate("regions", scene.encoding.objectness_logit.shape[1], dim=-1):
-            with poutine.mask(mask=True if counted is None else counted):
-                pyro.sample("objectness", Objectness(logits=scene.encoding.objectness_logit))
+        regions = pyro.plate("regions", scene.encoding.objectness_logit.shape[1], dim=-1)
+        counted = True if scene.assignment.counted is None else scene.assignment.counted
+        with scenes, regions, poutine.mask(mask=counted):
+            pyro.sample("objectness", Objectness(logits=scene.encoding.objectness_logit))
         with scenes, pyro.plate("objects", assigned.shape[1], dim=-1), poutine.mask(mask=assigned):
             label = self._label(batch, q)
             latent = self._prior().category_dim
