@@ -169,7 +169,7 @@ def azimuths() -> None:
         pyro.sample("azimuth", WrappedNormal(torch.tensor(3.14), torch.tensor(0.3)).expand((8,)))
 
 
-chain = MCMC(NUTS(azimuths, max_tree_depth=4), num_samples=100, warmup_steps=60, disable_progbar=True)
+chain = MCMC(NUTS(azimuths, max_tree_depth=4), num_samples=80, warmup_steps=40, disable_progbar=True)
 chain.run()
 found = chain.get_samples()["azimuth"].flatten()
 figure, axis = plt.subplots(figsize=(6, 2))

@@ -124,6 +124,7 @@ def random_batch(
         shape_loc=torch.randn(scenes, slots, d, generator=g, dtype=torch.float64),
         shape_scale=uniform(0.2, 0.6, scenes, slots, d),
         noise=torch.randn(scenes, slots, d, generator=g, dtype=torch.float64),
+        decode_order=torch.rand(scenes, slots, generator=g, dtype=torch.float64),
     )
 
 
