@@ -13,6 +13,11 @@ class InputError(NolboError, ValueError):
     """Input that cannot be used: the message names where it came from, what was got and what was expected."""
 
 
+def located(error: InputError, file: str | PathLike[str]) -> InputError:
+    """The same error with the file it came from before it."""
+    return InputError(f"{file}: {error}")
+
+
 def input_error(
     what: str,
     *,

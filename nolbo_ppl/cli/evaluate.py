@@ -28,7 +28,8 @@ from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_ta
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
-from nolbo_ppl.io.files import write_json
+from nolbo_ppl.io.files import read_json_object, write_json
+from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
@@ -88,6 +89,17 @@ class EvaluateConfig:
     """Scenes that go through the network at once."""
     pictures: bool = True
     """Draw plots and examples, and put them with every figure into index.html."""
+
+
+PICTURES = ("precision_recall", "reliability", "confusion", "viewpoint", "size", "shape", "retrieval", "examples", "detections")
+RESULT = ("metrics.json", "index.html", *(f"{name}.png" for name in PICTURES))
+"""Files of an evaluation."""
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder holds an evaluation that another may replace."""
+    file = folder / "metrics.json"
+    return file.is_file() and {"intervals", "configuration", "versions"} <= set(read_json_object(file))
 
 
 def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
@@ -257,6 +269,11 @@ def run(config: EvaluateConfig) -> Evaluation:
         raise input_error("photographs have a run of their own", do="call run_photographs")
     if config.peer:
         raise input_error("a peer without photographs", got=config.peer, do="give --photographs too")
+    with output_folder(config.out, RESULT, is_own=is_result) as folder:
+        return _evaluate(config, folder)
+
+
+def _evaluate(config: EvaluateConfig, folder: Path) -> Evaluation:
     loaded = load(config.model)
     model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
     scenes = open_scenes(config, model.config)
@@ -268,9 +285,9 @@ def run(config: EvaluateConfig) -> Evaluation:
         estimates = {**evaluation.figures, **retrieval_figures(found, rng, config.resamples)}
         evaluation = replace(evaluation, figures=estimates, retrieval=found)
     values = metrics(evaluation, config)
-    write_json(config.out / "metrics.json", values)
+    write_json(folder / "metrics.json", values)
     if config.pictures:
-        _draw(evaluation, values, scenes, model, config.out)
+        _draw(evaluation, values, scenes, model, folder)
     return evaluation
 
 
@@ -283,12 +300,17 @@ def run_photographs(config: EvaluateConfig) -> PhotographEvaluation:
     """
     if config.photographs is None or config.scenes is not None or config.cad is not None:
         raise input_error("photographs and scenes in one evaluation", do="give --photographs alone")
+    with output_folder(config.out, RESULT, is_own=is_result) as folder:
+        return _evaluate_photographs(config, config.photographs, folder)
+
+
+def _evaluate_photographs(config: EvaluateConfig, photographs: Path, folder: Path) -> PhotographEvaluation:
     loaded = load(config.model)
     model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
     peers = [OnnxPeer(path, model.config.categories) for path in config.peer]
     count = None if config.count == EvaluateConfig.count else config.count
     evaluation = evaluate_photographs(
-        config.photographs,
+        photographs,
         model,
         peers,
         threshold=config.threshold,
@@ -298,14 +320,14 @@ def run_photographs(config: EvaluateConfig) -> PhotographEvaluation:
         resamples=config.resamples,
     )
     values = photograph_metrics(evaluation, config, model.config.categories)
-    write_json(config.out / "metrics.json", values)
+    write_json(folder / "metrics.json", values)
     if config.pictures:
         from nolbo_ppl.viz.detection_plots import write_detections
         from nolbo_ppl.viz.evaluation_page import write_page
 
-        scenes, picture = PhotographScenes(evaluation.photos), config.out / "detections.png"
+        scenes, picture = PhotographScenes(evaluation.photos), folder / "detections.png"
         write_detections(evaluation.scores.pooled, scenes, model, picture)
-        write_page(values, [picture], config.out / "index.html")
+        write_page(values, [picture], folder / "index.html")
     return evaluation
 
 

@@ -18,6 +18,7 @@ from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
 from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.files import atomic_path, write_jsonl
+from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 
@@ -64,7 +65,11 @@ class ObserveSummary:
 
 
 def run(config: ObserveConfig) -> ObserveSummary:
-    """Observe every image of the folder; `observations.jsonl` appears complete or not at all."""
+    """Observe every image of the folder; the results appear complete or not at all.
+
+    Raises:
+        InputError: no images, no such model, or an output folder that holds something else.
+    """
     frames, model = open_frames(config.images), load(config.model)
     if config.camera is not None:
         if config.intrinsics is not None:
@@ -73,14 +78,25 @@ def run(config: ObserveConfig) -> ObserveSummary:
         config = replace(config, intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy))
     if config.out.resolve() == config.images.resolve():
         raise input_error("pictures would be written over the images", got=config.out, do="choose another --out")
-    config.out.mkdir(parents=True, exist_ok=True)
-    rows = list(_rows(config, frames, model))
-    write_jsonl(config.out / "observations.jsonl", rows)
+    names = [picture_name(frames.name(k)) for k in range(len(frames))] if config.pictures else []
+    with output_folder(config.out, ("observations.jsonl", *names), is_own=is_result) as folder:
+        rows = list(_rows(config, frames, model, folder))
+        write_jsonl(folder / "observations.jsonl", rows)
     guessed = guessed_camera(frames.size)[1] if config.intrinsics is None else ""
     return ObserveSummary(len(frames), len(rows), config.out / "observations.jsonl", guessed)
 
 
-def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel) -> Iterator[dict]:
+def picture_name(name: str) -> str:
+    """File of a frame's picture."""
+    return f"{name if '#' in name else Path(name).stem}.png"
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder holds observations that others may replace; those of a run belong to it."""
+    return (folder / "observations.jsonl").is_file() and not (folder / "run.json").exists()
+
+
+def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel, folder: Path) -> Iterator[dict]:
     bar = tqdm(total=len(frames), desc="observing", unit="image", disable=None)
     with bar:
         for first in range(0, len(frames), config.batch):
@@ -92,16 +108,16 @@ def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel)
             for k, image, observations in zip(part, images, observed):
                 yield from observations.rows(k, frames.name(k))
                 if config.pictures:
-                    _draw(config, frames.name(k), image, observations, model)
+                    _draw(config, folder / picture_name(frames.name(k)), image, observations, model)
             bar.update(len(part))
 
 
-def _draw(config: ObserveConfig, name: str, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:
+def _draw(config: ObserveConfig, path: Path, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:
     """The posterior over the image, as `OUT/NAME.png`."""
     from nolbo_ppl.viz.posterior_plots import draw_observations  # matplotlib is only needed for pictures
 
     camera = guessed_intrinsics(image) if config.intrinsics is None else np.array(config.intrinsics)
-    with atomic_path(config.out / f"{name if '#' in name else Path(name).stem}.png") as temporary:
+    with atomic_path(path) as temporary:
         draw_observations(image, observations, camera, prior_mean=model.prior_mean(), path=temporary)
 
 

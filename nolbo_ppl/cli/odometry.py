@@ -22,8 +22,10 @@ from nolbo_ppl.data.sequences import (
     without_distortion,
 )
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import atomic_path, write_json
+from nolbo_ppl.io.files import atomic_path, read_json_object, write_json
 from nolbo_ppl.io.images import exif_focal_length
+from nolbo_ppl.io.npz import save_npz
+from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, read_frame_poses, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, path_length
 from nolbo_ppl.odometry import (
@@ -161,14 +163,21 @@ def summary(odometry: Odometry, truth: np.ndarray | None, seconds: float) -> dic
     return figures
 
 
+RESULT = ("odometry.txt", COVARIANCE, "times.txt", "odometry.json")
+"""Files of an odometry."""
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder holds an odometry that another may replace."""
+    file = folder / "odometry.json"
+    return file.is_file() and {"options", "config", "version"} <= set(read_json_object(file))
+
+
 def write_odometry(out: Path, odometry: Odometry, times: np.ndarray | None, report: dict[str, Any]) -> None:
     """Write odometry.txt (KITTI rows), odometry_covariance.npz, times.txt where known, and odometry.json, each atomically."""
-    out.mkdir(parents=True, exist_ok=True)
     write_trajectory(out / "odometry.txt", Trajectory(odometry.T_world_camera))
-    with atomic_path(out / COVARIANCE) as temporary:
-        np.savez(
-            temporary, covariance=odometry.covariance, matches=odometry.matches, inliers=odometry.inliers, flags=odometry.flags
-        )
+    names = ("covariance", "matches", "inliers", "flags")
+    save_npz(out / COVARIANCE, {name: getattr(odometry, name) for name in names}, compressed=False)
     if times is not None:
         with atomic_path(out / "times.txt") as temporary:
             temporary.write_text("".join(f"{stamp!r}\n" for stamp in times.tolist()), encoding="utf-8")
@@ -179,8 +188,14 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
     """Read, estimate, write; returns the odometry and the report.
 
     Raises:
-        InputError: unusable input; nothing half-written is left.
+        InputError: unusable input, or an output folder that holds something else; an older result stays as it was.
     """
+    inputs = (arguments.intrinsics, arguments.truth, arguments.lengths)
+    with output_folder(arguments.out, RESULT, is_own=is_result, inputs=inputs) as folder:
+        return _estimate(arguments, folder)
+
+
+def _estimate(arguments: OdometryArguments, folder: Path) -> tuple[Odometry, dict[str, Any]]:
     frames, remarks = open_frames(arguments.images), list[str]()
     if arguments.intrinsics is None:
         first = frames.files[0] if isinstance(frames, ImageFolder) else None
@@ -198,7 +213,7 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
         name: str(value) if isinstance(value, Path) else value for name, value in asdict(arguments).items() if name != "config"
     }
     report = {"version": __version__, "options": options, "config": asdict(arguments.config), **figures, "remarks": remarks}
-    write_odometry(arguments.out, odometry, frame_times(part), report)
+    write_odometry(folder, odometry, frame_times(part), report)
     return odometry, report
 
 

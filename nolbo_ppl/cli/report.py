@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.report import write_report
 
 
@@ -36,6 +37,8 @@ def run(arguments: ReportArguments) -> Path:
     Raises:
         InputError: no result in the folder, or a file that is malformed or does not match.
     """
+    if arguments.out is not None and arguments.out.suffix.lower() not in (".html", ".htm"):
+        raise input_error("the report is a page", got=f"--out {arguments.out}", expected="a name that ends in .html")
     return write_report(
         arguments.run_dir,
         odometry=arguments.odometry,

@@ -9,8 +9,9 @@ from pathlib import Path
 import tyro
 
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
-from nolbo_ppl.inference.slam.map_files import write_result
+from nolbo_ppl.inference.slam.map_files import RESULT, is_result, write_result
 from nolbo_ppl.io.observations import read_observations
+from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.trajectories import TIME_TOLERANCE, read_covariance, read_frame_poses, read_trajectory
 from nolbo_ppl.io.trajectory_tables import TableFormat
 
@@ -52,8 +53,15 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
     """Read, solve, write; returns the result and the summary.
 
     Raises:
-        NolboError: bad input, or a graph that cannot be solved; nothing half-written is left.
+        NolboError: bad input, an output folder that holds something else, or a graph that cannot be solved; an older result
+            stays as it was.
     """
+    inputs = (arguments.odometry, arguments.observations, arguments.odometry_covariance, arguments.truth)
+    with output_folder(arguments.out, RESULT, is_own=is_result, inputs=inputs) as folder:
+        return _solve(arguments, folder)
+
+
+def _solve(arguments: SlamArguments, folder: Path) -> tuple[SlamResult, dict[str, object]]:
     odometry = read_trajectory(arguments.odometry, arguments.odometry_format)
     table = read_observations(arguments.observations, frames=len(odometry))
     truth, remarks = None, []
@@ -83,8 +91,8 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
         result = solve(problem, arguments.config)
     from nolbo_ppl.viz.map_plots import draw_slam_result
 
-    report = write_result(arguments.out, result, odometry, truth, model=model)
-    draw_slam_result(arguments.out / "map.png", odometry.T_world_camera, result, truth)
+    report = write_result(folder, result, odometry, truth, model=model)
+    draw_slam_result(folder / "map.png", odometry.T_world_camera, result, truth)
     return result, report | {"remarks": remarks}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import read_jsonl
 from nolbo_ppl.io.images import image_size, open_image
+from nolbo_ppl.io.npz import read_voxels
 from nolbo_ppl.io.scenes import SceneRecord, image_field, parse_record
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.dataset_writer import SCENES
@@ -116,22 +116,7 @@ class SceneFolder:
 
     def _read_voxels(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         file = self.path / "voxels.npz"
-        if not file.is_file():
-            return {}
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                voxels = {name: stored[name] for name in stored.files}
-        except (ValueError, OSError, zipfile.BadZipFile) as error:
-            raise input_error("not a file of voxels", got=error, expected="an .npz of packed bits", file=file) from None
-        for name, bits in voxels.items():
-            if bits.dtype != np.uint8 or bits.shape != (VOXELS**3 // 8,):
-                raise input_error(
-                    f"voxels of {name}",
-                    got=f"{bits.dtype} {bits.shape}",
-                    expected=f"uint8 [{VOXELS**3 // 8}]: {VOXELS}^3 packed bits",
-                    file=file,
-                )
-        return voxels
+        return read_voxels(file) if file.is_file() else {}
 
     def _placing(self, row: int) -> tuple[float, float, float]:
         """Scale and shift (px) that `letterbox` gives the image of a row."""

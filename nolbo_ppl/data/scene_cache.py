@@ -22,6 +22,8 @@ from tqdm import tqdm
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import write_json
+from nolbo_ppl.io.npz import Npz
+from nolbo_ppl.io.output_folder import locked
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.synthetic.assets.shape_library import BLOCK, VOXELS
 from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
@@ -109,14 +111,24 @@ def write_cache(cache: str | os.PathLike[str], source: Source, count: int, worke
     shards = -(-count // BLOCK)
     missing = [shard for shard in range(shards) if not (folder / f"shard-{shard:05d}").is_dir()]
     if missing:
-        for leftover in folder.glob(".shard-*.tmp"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        write_json(folder / "source.json", {"version": VERSION, "slots": slots, **source.describe()})
-        jobs = [(_write_shard, (source, folder, shard, slots)) for shard in missing]
-        with tqdm(total=len(missing) * BLOCK, desc="rendering scenes", unit="scene", disable=None) as bar:
-            for done in parallel(jobs, workers):
-                bar.update(done)
+        with locked(folder, wait=True):  # another run may render the same scenes: what it has made is not made again
+            for leftover in folder.glob(".shard-*.tmp"):
+                shutil.rmtree(leftover, ignore_errors=True)
+            write_json(folder / "source.json", {"version": VERSION, "slots": slots, **source.describe()})
+            missing = [shard for shard in missing if not (folder / f"shard-{shard:05d}").is_dir()]
+            jobs = [(_write_shard, (source, folder, shard, slots)) for shard in missing]
+            with tqdm(total=len(missing) * BLOCK, desc="rendering scenes", unit="scene", disable=None) as bar:
+                for done in parallel(jobs, workers):
+                    bar.update(done)
     return CachedScenes(folder, count)
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """An array that stays on the disk. Raises `InputError` for a damaged file."""
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # NumPy raises whatever damaged bytes make it run into
+        raise input_error("damaged cache", got=error, do=f"delete {path.parent}", file=path) from None
 
 
 class CachedScenes:
@@ -143,13 +155,13 @@ class CachedScenes:
         self.count = count
         self.categories = CATEGORIES
         shards = shards[: -(-count // BLOCK)]
-        self._images = [np.load(shard / "images.npy", mmap_mode="r") for shard in shards]
-        self._voxels = [np.load(shard / "voxels.npy", mmap_mode="r") for shard in shards]
+        self._images = [_mapped(shard / "images.npy") for shard in shards]
+        self._voxels = [_mapped(shard / "voxels.npy") for shard in shards]
         self._voxel_row: list[np.ndarray] = []
         parts: list[Arrays] = []
         for shard in shards:
-            with np.load(shard / "labels.npz", allow_pickle=False) as stored:
-                labels = dict(stored)
+            with Npz(shard / "labels.npz") as stored:
+                labels = {name: stored.array(name, kinds="fiub", finite=False) for name in stored.names}
             self._voxel_row.append(np.searchsorted(labels.pop("voxel_instance"), labels["instance"].clip(0)))
             parts.append(labels)
         self.labels: Arrays = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}

@@ -8,7 +8,7 @@ average of the weights that evaluation and export use. The step goes through the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -164,19 +164,20 @@ def state_tensors(state: OptimisationState) -> dict[str, Tensor]:
     }
 
 
-def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
 def module_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """The module's own state dictionary among the tensors of `state_tensors`."""
-    return _part(tensors, "model/")
+    return part_of(tensors, "model/")
 
 
 def restore(state: OptimisationState, tensors: dict[str, Tensor], at_step: int) -> OptimisationState:
     """Put a state back to what `state_tensors` saved, bit for bit."""
     state.module.load_state_dict(module_tensors(tensors))
-    state.average = {name: value.clone() for name, value in _part(tensors, "average/").items()}
-    restore_optimizer(state.optimizer, _part(tensors, "optimizer/"), dict(state.module.named_parameters()))
+    state.average = {name: value.clone() for name, value in part_of(tensors, "average/").items()}
+    restore_optimizer(state.optimizer, part_of(tensors, "optimizer/"), dict(state.module.named_parameters()))
     state.step = at_step
     return state

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeGuard
+import dataclasses
+from collections.abc import Mapping
+from types import UnionType
+from typing import Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from jaxtyping import Float
+
+from nolbo_ppl.errors import input_error
 
 LARGEST = 1e30
 """Largest number taken from a file: its unit squared still fits 64 bits, itself 32 bits."""
@@ -46,6 +51,50 @@ def number_array(value: Any, shape: tuple[int | None, ...], largest: float = LAR
         return None
     array = np.array(value, dtype=np.float64)
     return array if array.ndim == len(shape) else None
+
+
+def check_fields(cls: type, values: Mapping[str, Any], most: int, most_of: Mapping[str, int]) -> dict[str, Any]:
+    """Values of a JSON object for a dataclass of flat fields; lists become tuples.
+
+    Args:
+        cls: the dataclass; its fields are bool, int, float, str, `Literal`, or tuples of one of them.
+        values: what the file holds.
+        most: greatest whole number of any field, and longest list; numbers are 1e6 at most.
+        most_of: greatest whole number by field, where it is another.
+
+    Raises:
+        InputError: an unknown field, or a value of another type or out of range; names the field.
+    """
+    hints = get_type_hints(cls)
+    names = [field.name for field in dataclasses.fields(cls)]
+    unknown = sorted(set(values) - set(names))
+    if unknown:
+        raise input_error("unknown field", got=unknown, expected=f"some of {names}")
+    found = {}
+    for name, value in values.items():
+        if not _fits(value, hints[name], most_of.get(name, most)):
+            kind = hints[name].__name__ if isinstance(hints[name], type) else str(hints[name]).removeprefix("typing.")
+            raise input_error(name, got=repr(value), expected=f"{kind}, at most {most_of.get(name, most)}")
+        found[name] = tuple(value) if isinstance(value, list) else value
+    return found
+
+
+def _fits(value: Any, hint: Any, most: int) -> bool:
+    if get_origin(hint) is tuple:
+        inner = get_args(hint)
+        if not isinstance(value, list | tuple) or len(value) > 100_000:
+            return False
+        inner = inner[:1] * len(value) if inner[1:] == (...,) else inner
+        return len(inner) == len(value) and all(_fits(item, kind, most) for item, kind in zip(value, inner))
+    if get_origin(hint) is Literal:
+        return any(value == choice and type(value) is type(choice) for choice in get_args(hint))
+    if hint is bool or hint is str:
+        return isinstance(value, hint)
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, kind, most) for kind in get_args(hint))
+    if hint is type(None):
+        return value is None
+    return is_whole(value, 0, most) if hint is int else is_number(value, -1e6, 1e6)
 
 
 def _is_nested(value: Any, shape: tuple[int | None, ...], largest: float) -> bool:

@@ -52,11 +52,20 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def inside(folder: str | os.PathLike[str], name: str) -> Path | None:
-    """Path of a name within a folder, None where it leads out of it: by `..`, as an absolute path, or over a link."""
-    if not name or "\0" in name:
+def inside(folder: str | os.PathLike[str], name: str, *, follow: bool = False) -> Path | None:
+    """Path of a name within a folder, None where it leads out of it: by `..`, as an absolute path, or over a link.
+
+    Args:
+        folder: the folder.
+        name: a name that some file holds, and that need not be well meant.
+        follow: links lead where they like: who put them into the folder has said so.
+    """
+    plain = os.path.normpath(name) if name and "\0" not in name else ".."
+    if os.path.isabs(plain) or plain.split(os.sep)[0] == "..":
         return None
     path, root = Path(folder) / name, Path(folder).resolve()
+    if follow:
+        return path
     try:
         return path if path.resolve().is_relative_to(root) else None
     except (OSError, RuntimeError):  # names that are too long; links in a circle

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 from numpy.lib import format as npy
 
 from nolbo_ppl.errors import InputError, input_error
@@ -151,10 +152,45 @@ class Npz:
         return value
 
 
-def read_npz(path: str | os.PathLike[str], shapes: Mapping[str, Shape], largest: int = LARGEST_ARRAY) -> dict[str, np.ndarray]:
+def read_npz(
+    path: str | os.PathLike[str], shapes: Mapping[str, Shape | None], largest: int = LARGEST_ARRAY
+) -> dict[str, np.ndarray]:
     """The named arrays of numbers of an NPZ file, checked as `Npz.array` does. Raises `InputError` as that does."""
     with Npz(path, largest) as archive:
         return {name: archive.array(name, shape) for name, shape in shapes.items()}
+
+
+def read_voxels(path: str | os.PathLike[str], side: int = 32) -> dict[str, UInt8[np.ndarray, " bytes"]]:
+    """Packed occupancy of instances, `side`^3 bits each, by name.
+
+    Raises:
+        InputError: as `Npz`, or an array of another form.
+    """
+    with Npz(path) as archive:
+        for name, header in archive.headers.items():
+            if header.dtype != np.uint8 or header.shape != (side**3 // 8,):
+                got, expected = f"{header.dtype} {list(header.shape)}", f"uint8 [{side**3 // 8}]: {side}^3 packed bits"
+                raise input_error(f"voxels of {name}", got=got, expected=expected, file=archive.path)
+        return {name: archive.array(name) for name in archive.names}
+
+
+def read_npy(path: str | os.PathLike[str], shape: Shape, largest: int = LARGEST_ARRAY) -> np.ndarray:
+    """The array of numbers of an NPY file; NaN and infinity stay. Raises `InputError` naming the file."""
+    path = existing_file(path)
+    try:
+        with reading(path), path.open("rb") as file:
+            version = npy.read_magic(file)
+            found, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
+            wrong = len(found) != len(shape) or any(want not in (None, have) for want, have in zip(shape, found))
+            if wrong or dtype.kind not in "fiu" or ArrayHeader(found, dtype).nbytes > largest:
+                expected = f"numbers of shape {shape}, at most {largest} bytes"
+                raise input_error("array", got=f"shape {found} of {dtype}", expected=expected, file=path)
+            file.seek(0)
+            return npy.read_array(file, allow_pickle=False)
+    except InputError:
+        raise
+    except Exception as error:  # as in `Npz`
+        raise input_error("not a readable NPY file", got=error, do="is it truncated?", file=path) from None
 
 
 def save_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True) -> None:

@@ -23,6 +23,7 @@ from jaxtyping import Float
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.rotation import quaternion_to_matrix
+from nolbo_ppl.io.files import inside
 
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may lie from 1."""
@@ -194,7 +195,10 @@ def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Pat
     name = row.get("image")
     if not isinstance(name, str) or not name:
         raise input_error("image", got=name, expected="a path relative to the folder", file=file, line=line)
-    path = folder / name
+    path = inside(folder, name, follow=True)
+    if path is None:
+        do = "link the images into the folder"
+        raise input_error("image", got=name, expected="a path within the folder", do=do, file=file, line=line)
     if not path.is_file():
         raise input_error(
             "image",

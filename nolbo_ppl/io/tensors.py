@@ -70,9 +70,18 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Mapping[int, str]
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> None:
-    """Put back what `optimizer_tensors` gave, bit for bit."""
+    """Put back what `optimizer_tensors` gave, bit for bit.
+
+    Raises:
+        InputError: a parameter nobody knows, or values that do not fit it; names it.
+    """
     for name, tensor in tensors.items():
-        parameter, key = name.rsplit("/", 1)
+        parameter, _, key = name.rpartition("/")
+        if parameter not in parameters:
+            raise input_error("state of the optimiser", got=name, expected="NAME/KEY of a parameter")
+        if tensor.dim() and tensor.shape != parameters[parameter].shape:
+            expected = tuple(parameters[parameter].shape)
+            raise input_error(f"state {name} of the optimiser", got=tuple(tensor.shape), expected=expected)
         optimizer.state[parameters[parameter]][key] = tensor.clone()
 
 
@@ -95,7 +104,7 @@ def check_tensors(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], file
             raise input_error(f"weight {name}", got=tuple(tensor.shape), expected=f"shape {tuple(own[name].shape)}", file=file)
         if _kind(tensor) != _kind(own[name]):
             raise input_error(f"weight {name}", got=tensor.dtype, expected=_kind(own[name]), file=file)
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor.to(own[name].dtype)).all()):
+        if tensor.is_floating_point() and not tensor.is_meta and not bool(torch.isfinite(tensor.to(own[name].dtype)).all()):
             raise input_error(f"weight {name}", got="NaN or infinity", expected="finite numbers", file=file)
 
 

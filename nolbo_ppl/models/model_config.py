@@ -8,6 +8,15 @@ from typing import Any, Literal
 
 from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.fields import check_fields
+
+LARGEST = 8192
+"""Largest whole number a configuration may hold: widths, sides, labels; networks beyond do not fit any memory."""
+LARGEST_OF = {
+    **dict.fromkeys(("encoder_blocks", "glimpse_blocks", "glimpse", "predictors", "azimuth_components"), 64),
+    **dict.fromkeys(("symmetry", "instance_category"), 100_000),
+}
+"""The same of single fields: blocks are modules of their own."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +151,12 @@ class ModelConfig:
                     got=f"{len(channels)} for {self.voxel_size}",
                     expected="one channel count per doubling of a 4^3 grid",
                 )
+        scales = ("max_concentration", "orientation_scale", "rotation_concentration", "box_scale", "range_scale")
+        positive = (*scales, "head_width", "predictors", "latent_dim", "prior_width")
+        lists = ("encoder_channels", "decoder_channels", "voxel_encoder_channels", "box_spread", "range_spread")
+        for name, numbers in [(n, (getattr(self, n),)) for n in positive] + [(n, getattr(self, n)) for n in lists]:
+            if not all(number > 0 for number in numbers):
+                raise input_error(name, got=getattr(self, name), expected="above 0")
         if not 0 < self.objectness_epsilon < 0.5:
             raise input_error("objectness_epsilon", got=self.objectness_epsilon, expected="a number in (0, 0.5)")
 
@@ -166,13 +181,10 @@ class ModelConfig:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> ModelConfig:
-        """From `to_json`'s dictionary. Raises `InputError` naming an unknown field."""
-        names = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - names)
-        if unknown:
-            raise input_error("unknown model configuration", got=unknown, expected=f"fields among {sorted(names)}")
-        fields: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
-        return cls(**fields)
+        """From `to_json`'s dictionary. Raises `InputError` naming a field that is unknown, of another type or out of range."""
+        if not isinstance(values, dict):
+            raise input_error("model configuration", got=type(values).__name__, expected="an object")
+        return cls(**check_fields(cls, values, LARGEST, LARGEST_OF))
 
 
 def tiny() -> ModelConfig:

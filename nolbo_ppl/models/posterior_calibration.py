@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.fields import is_number
 from nolbo_ppl.models.observed_scene import RegionParameters
 
 
@@ -37,13 +38,13 @@ class Calibration:
     """Correlation of the shape latent's errors in two views of one object: what many views together can tell."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.shape_correlation < 1:
+        if not (is_number(self.shape_correlation) and 0 <= self.shape_correlation < 1):
             raise input_error("shape_correlation", got=self.shape_correlation, expected="a correlation from 0 to below 1")
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name == "shape_correlation":
                 continue
-            if not (isinstance(value, (int, float)) and abs(value) < 1e6) or (field.name != "objectness_shift" and value <= 0):
+            if not (is_number(value) and abs(value) < 1e6) or (field.name != "objectness_shift" and value <= 0):
                 raise input_error(f"calibration factor {field.name}", got=value, expected="a positive finite number")
 
     def objectness(self, logit: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -68,7 +69,9 @@ class Calibration:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Calibration:
-        """From `to_json`'s dictionary."""
+        """From `to_json`'s dictionary. Raises `InputError` naming a factor that is unknown or no number."""
+        if not isinstance(values, dict):
+            raise input_error("calibration", got=type(values).__name__, expected="an object of factors")
         unknown = sorted(set(values) - {field.name for field in dataclasses.fields(cls)})
         if unknown:
             raise input_error("unknown calibration factors", got=unknown)

@@ -20,7 +20,8 @@ from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online
 from nolbo_ppl.inference.slam.map_files import library_versions, write_result
-from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.io.files import read_json, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.io.observations import read_observations
 from nolbo_ppl.io.trajectories import Trajectory, covariance_beside, read_trajectory, write_trajectory
 from nolbo_ppl.pipeline.depth_refinement import DepthScale
@@ -108,8 +109,7 @@ class ObjectMappingPipeline:
         write_camera(self.out / "intrinsics.json", self.drive.camera)
         T, covariance = found.at(rows)
         if covariance is not None:
-            with atomic_path(self.out / "odometry_covariance.npz") as temporary:
-                np.savez_compressed(temporary, covariance=covariance)
+            save_npz(self.out / "odometry_covariance.npz", {"covariance": covariance})
         if self.drive.truth is not None:
             write_trajectory(self.out / "truth.txt", Trajectory(self.drive.truth[used]))
         write_trajectory(self.out / "odometry.txt", Trajectory(T))
@@ -158,8 +158,8 @@ class ObjectMappingPipeline:
     def map(self) -> None:
         """Landmarks' shapes in the world as one GLB."""
         landmarks = read_json(self.out / "slam" / "landmarks.json")
-        with np.load(self.out / "slam" / "landmarks_voxels.npz", allow_pickle=False) as arrays:
-            voxels = {name.removesuffix("/mean"): arrays[name] for name in arrays.files if name.endswith("/mean")}
+        with Npz(self.out / "slam" / "landmarks_voxels.npz") as arrays:
+            voxels = {name.removesuffix("/mean"): arrays.array(name) for name in arrays.names if name.endswith("/mean")}
         poses = read_trajectory(self.out / "slam" / "trajectory.txt").T_world_camera
         write_glb(self.out / "map.glb", build_scene(landmarks, voxels, poses))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
+import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
@@ -13,13 +13,18 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import read_json, read_jsonl
+from nolbo_ppl.io.fields import is_whole, number_array
+from nolbo_ppl.io.files import inside, read_json, read_json_object, read_jsonl
+from nolbo_ppl.io.npz import Npz
+from nolbo_ppl.io.output_folder import settle
 from nolbo_ppl.io.trajectories import read_frame_poses, read_trajectory
 from nolbo_ppl.metrics.trajectory import align
 from nolbo_ppl.report.run_landmarks import RunAssociations, RunLandmark, read_associations, read_landmarks
 from nolbo_ppl.viz.map_plots import principal_plane
 
 Poses = Float[np.ndarray, "n 4 4"]
+MOST_VOXELS = 128
+"""Longest side of a decoded shape that is shown."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +87,14 @@ class RunFolder:
     @cached_property
     def voxel_names(self) -> frozenset[str]:
         """Landmarks with a decoded shape."""
+        archive = self._voxels
+        return frozenset(() if archive is None else (n[: -len("/mean")] for n in archive.names if n.endswith("/mean")))
+
+    @cached_property
+    def _voxels(self) -> Npz | None:
+        """The file of decoded shapes, open as long as the run."""
         path = self.slam / "landmarks_voxels.npz"
-        if not path.is_file():
-            return frozenset()
-        with _archive(path) as archive:
-            return frozenset(name[: -len("/mean")] for name in archive.files if name.endswith("/mean"))
+        return Npz(path) if path.is_file() else None
 
     def voxels(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Mean and variance of a landmark's occupancy, [n, n, n]; None without a decoded shape.
@@ -94,40 +102,26 @@ class RunFolder:
         Raises:
             InputError: the file cannot be read.
         """
-        if name not in self.voxel_names:
+        archive = self._voxels
+        if archive is None or name not in self.voxel_names:
             return None
-        path = self.slam / "landmarks_voxels.npz"
-        with _archive(path) as archive:
-            mean = archive[f"{name}/mean"].astype(np.float64)
-            known = f"{name}/variance" in archive.files
-            variance = archive[f"{name}/variance"].astype(np.float64) if known else mean * (1 - mean)
-        if mean.ndim != 3 or len(set(mean.shape)) != 1 or variance.shape != mean.shape:
-            raise input_error(
-                "voxels of a landmark", got=f"{name}: {mean.shape}, {variance.shape}", expected="[n, n, n] both", file=path
-            )
+        side = max(archive.headers[f"{name}/mean"].shape, default=0)
+        cube = (side, side, side)
+        if not 0 < side <= MOST_VOXELS:
+            raise input_error(f"voxels of {name}", got=f"side {side}", expected=f"1 to {MOST_VOXELS}", file=archive.path)
+        mean = archive.array(f"{name}/mean", cube, kinds="f").astype(np.float64)
+        known = f"{name}/variance" in archive.headers
+        variance = archive.array(f"{name}/variance", cube, kinds="f").astype(np.float64) if known else mean * (1 - mean)
         return mean, variance
 
     def crop(self, name: str) -> Path | None:
-        """Best picture of a landmark; None when there is none (or the name would lead out of the folder)."""
-        folder = self.path / "crops"
-        path = folder / f"{name}.png"
-        return path if "\0" not in name and path.parent == folder and path.is_file() else None
-
-
-def _archive(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise input_error("not a readable NPZ file", got=error, file=path) from None
+        """Best picture of a landmark; None when there is none, or it would lead out of the run's folder."""
+        path = inside(self.path, f"crops/{name}.png")
+        return path if path is not None and path.parent == self.path / "crops" and path.is_file() else None
 
 
 def _json(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    value = read_json(path)
-    if not isinstance(value, dict):
-        raise input_error("not a JSON object", got=type(value).__name__, file=path)
-    return value
+    return read_json_object(path) if path.is_file() else {}
 
 
 def _rows(path: Path | None, count: int, times: np.ndarray | None, what: str) -> Poses | None:
@@ -138,36 +132,38 @@ def _rows(path: Path | None, count: int, times: np.ndarray | None, what: str) ->
 def _iterations(path: Path, count: int) -> Iterations | None:
     if not path.is_file():
         return None
-    with _archive(path) as archive:
-        if "T_world_camera" not in archive.files:
-            raise input_error("iterations without `T_world_camera`", got=archive.files, file=path)
-        T = archive["T_world_camera"].astype(np.float64)
-        if T.ndim != 4 or T.shape[1:] != (count, 4, 4):
-            raise input_error("`T_world_camera` of the iterations", got=T.shape, expected=f"[i, {count}, 4, 4]", file=path)
+    with Npz(path) as archive:
+        T = archive.array("T_world_camera", (None, count, 4, 4)).astype(np.float64)
+        names = [f"landmarks_{i}" for i in range(len(T))]
         landmarks = tuple(
-            archive[f"landmarks_{i}"].astype(np.float64).reshape(-1, 3) if f"landmarks_{i}" in archive.files else np.zeros((0, 3))
-            for i in range(len(T))
+            archive.array(name, (None, 3)).astype(np.float64) if name in archive.headers else np.zeros((0, 3)) for name in names
         )
     return Iterations(T, landmarks)
 
 
-def _frames(folder: Path, count: int) -> tuple[tuple[Path | None, ...], np.ndarray | None]:
-    """Pictures and times of the keyframes; a relative picture is looked for beside the run, then from here."""
+def _frames(folder: Path, count: int, pictures: Path | None) -> tuple[tuple[Path | None, ...], np.ndarray | None]:
+    """Pictures and times of the keyframes; pictures are looked for in the run's folder and in that of the pictures alone."""
     path = folder / "frames.jsonl"
     if not path.is_file():
         return (), None
     rows = [row for _, row in read_jsonl(path)]
     if len(rows) != count:
         raise input_error("frames do not match the estimate", got=f"{len(rows)} lines", expected=f"{count}", file=path)
-    images = []
-    for row in rows:
-        given = Path(str(row["image"])) if row.get("image") is not None else None
-        tried = [] if given is None else [folder / given, given]
-        images.append(next((place for place in tried if place.is_file()), None))
-    times = [row.get("time") for row in rows]
-    if any(isinstance(t, bool) or not isinstance(t, (int, float)) for t in times):
-        return tuple(images), None
-    return tuple(images), np.array(times, dtype=np.float64)
+    images = tuple(_picture(row.get("image"), folder, pictures) for row in rows)
+    times = number_array([row.get("time") for row in rows], (count,))
+    return images, times
+
+
+def _picture(name: object, folder: Path, pictures: Path | None) -> Path | None:
+    """The file of a picture, where it lies within one of the folders: a file names it, and may have come from anywhere."""
+    if not isinstance(name, str):
+        return None
+    tried = [inside(folder, name)]
+    if pictures is not None:
+        given = (folder / name).resolve()
+        tried.append(inside(pictures, os.path.relpath(given, pictures.resolve())))
+        tried.append(inside(pictures, Path(name).name))
+    return next((place for place in tried if place is not None and place.is_file()), None)
 
 
 def _frame_of(path: Path | None) -> dict[str, int] | None:
@@ -177,7 +173,7 @@ def _frame_of(path: Path | None) -> dict[str, int] | None:
     frame_of = {}
     for number, row in read_jsonl(path):
         frame = row.get("frame")
-        if isinstance(frame, bool) or not isinstance(frame, int):
+        if not is_whole(frame):
             raise input_error("`frame` is no row number", got=frame, file=path, line=number)
         frame_of[str(row["id"]) if row.get("id") is not None else f"line-{number}"] = frame
     return frame_of
@@ -203,6 +199,7 @@ def read_run(
     odometry: str | PathLike[str] | None = None,
     observations: str | PathLike[str] | None = None,
     truth: str | PathLike[str] | None = None,
+    pictures: str | PathLike[str] | None = None,
 ) -> RunFolder:
     """Read the folder of `nolbo run` or of `nolbo slam`.
 
@@ -211,6 +208,8 @@ def read_run(
         odometry: trajectory before the correction, when it is not in the folder as `odometry.txt`.
         observations: what SLAM was given, when it is not in the folder as `observations.jsonl`.
         truth: true trajectory, when it is not in the folder as `truth.txt`.
+        pictures: folder of the images: those outside of the run's folder and of this one are not read, whatever
+            `frames.jsonl` says.
 
     Raises:
         InputError: no such folder, no trajectory and map in it, or a file that is malformed or does not match.
@@ -218,6 +217,7 @@ def read_run(
     path = Path(path)
     if not path.is_dir():
         raise input_error("no such folder of a run", file=path)
+    settle(path)
     slam = next((place for place in (path / "slam", path) if (place / "trajectory.txt").is_file()), None)
     if slam is None:
         raise input_error(
@@ -234,7 +234,7 @@ def read_run(
 
     answer = read_trajectory(slam / "trajectory.txt")
     estimate, count = answer.T_world_camera, len(answer)
-    images, times = _frames(path, count)
+    images, times = _frames(path, count, None if pictures is None else Path(pictures))
     times = answer.times if times is None else times
     truth_given = _rows(place(truth, "truth.txt"), count, times, "the truth")
     landmarks = read_landmarks(slam / "landmarks.json") if (slam / "landmarks.json").is_file() else ()

@@ -12,8 +12,11 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose, quaternion_to_matrix
+from nolbo_ppl.io.fields import is_number, number_array
 from nolbo_ppl.io.files import read_json, read_jsonl
 
+LARGEST = 1e9
+"""Largest coordinate, m, size or variance of a landmark that can be shown."""
 STRONG = 0.5
 """A detection belongs to the landmark that holds more than this of its weight."""
 
@@ -96,12 +99,10 @@ class RunAssociations:
 def _array(row: dict[str, Any], key: str, shape: tuple[int, ...], where: dict[str, Any]) -> np.ndarray | None:
     if row.get(key) is None:
         return None
-    try:
-        value = np.asarray(row[key], dtype=np.float64)
-    except (TypeError, ValueError):
-        value = np.zeros(0)
-    if value.shape != shape or not np.isfinite(value).all():
-        raise input_error(f"`{key}` of a landmark", got=row[key], expected=f"finite numbers of shape {shape}", **where)
+    value = number_array(row[key], shape, LARGEST)
+    if value is None:
+        expected = f"numbers of shape {shape}, at most {LARGEST:g}"
+        raise input_error(f"`{key}` of a landmark", got=row[key], expected=expected, **where)
     return value
 
 
@@ -109,7 +110,7 @@ def _number(row: dict[str, Any], key: str, where: dict[str, Any]) -> float | Non
     value = row.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+    if not is_number(value):
         raise input_error(f"`{key}` of a landmark", got=value, expected="a number", **where)
     return float(value)
 
@@ -123,11 +124,11 @@ def parse_landmark(row: Any, where: dict[str, Any]) -> RunLandmark:
     if not isinstance(row, dict) or "name" not in row or row.get("position") is None:
         raise input_error("a landmark needs a name and a position", got=repr(row)[:120], **where)
     quaternion = _array(row, "rotation", (4,), where)
-    if quaternion is not None and not np.linalg.norm(quaternion) > 0:
+    if quaternion is not None and not 0.9 < np.linalg.norm(quaternion) < 1.1:
         raise input_error("`rotation` of a landmark", got=row["rotation"], expected="a unit quaternion", **where)
     first, last = _number(row, "first_frame", where), _number(row, "last_frame", where)
     posterior = row.get("class_posterior") or {}
-    if not isinstance(posterior, dict) or not all(isinstance(p, (int, float)) for p in posterior.values()):
+    if not isinstance(posterior, dict) or not all(is_number(p, 0, 1) for p in posterior.values()):
         raise input_error("`class_posterior` of a landmark", got=posterior, expected="a probability by category", **where)
     position = _array(row, "position", (3,), where)
     assert position is not None
@@ -154,7 +155,10 @@ def read_landmarks(path: Path) -> tuple[RunLandmark, ...]:
     rows = read_json(path)
     if not isinstance(rows, list):
         raise input_error("the map is no list of landmarks", got=type(rows).__name__, file=path)
-    return tuple(parse_landmark(row, {"file": path}) for row in rows)
+    landmarks = tuple(parse_landmark(row, {"file": path}) for row in rows)
+    if len({landmark.name for landmark in landmarks}) < len(landmarks):
+        raise input_error("two landmarks of one name", expected="each name once", file=path)
+    return landmarks
 
 
 def read_associations(path: Path, names: Sequence[str], frame_of: dict[str, int] | None) -> RunAssociations:
@@ -172,7 +176,8 @@ def read_associations(path: Path, names: Sequence[str], frame_of: dict[str, int]
     rows = []
     for number, row in read_jsonl(path):
         weights = row.get("landmarks", {})
-        good = isinstance(weights, dict) and all(isinstance(w, (int, float)) for w in weights.values())
+        good = isinstance(weights, dict) and all(is_number(w, 0, 1) for w in weights.values())
+        good = good and all(row.get(name) is None or is_number(row[name], 0, 1) for name in ("new", "background"))
         if "id" not in row or not good:
             raise input_error(
                 "not an association", got=repr(row)[:120], expected='{"id": ..., "landmarks": {...}}', file=path, line=number
@@ -195,6 +200,6 @@ def read_associations(path: Path, names: Sequence[str], frame_of: dict[str, int]
         row=np.array([k for k, _, _ in found], dtype=np.int64),
         landmark=np.array([j for _, j, _ in found], dtype=np.int64),
         weight=np.array([w for _, _, w in found], dtype=np.float64),
-        new=np.array([float(row.get("new", 0.0)) for row in rows]),
-        background=np.array([float(row.get("background", 0.0)) for row in rows]),
+        new=np.array([float(row.get("new") or 0.0) for row in rows]),
+        background=np.array([float(row.get("background") or 0.0) for row in rows]),
     )

@@ -13,7 +13,10 @@ from tqdm import tqdm
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.io.npz import Npz, save_npz
+from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.parallel import parallel
+from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.scenes.scene_records import record_of
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 
@@ -36,8 +39,7 @@ def _write_chunk(source: SceneSource, out: Path, first: int, last: int) -> int:
         for label in rendered.labels:
             voxels.setdefault(label.instance, label.item.voxels)
     parts = out / ".parts"
-    with atomic_path(parts / f"{first:06d}.npz") as temporary:
-        np.savez(temporary, **voxels)  # type: ignore[arg-type]
+    save_npz(parts / f"{first:06d}.npz", voxels, compressed=False)
     write_jsonl(parts / f"{first:06d}.jsonl", rows)
     return last - first
 
@@ -55,11 +57,17 @@ def write_scenes(out: str | os.PathLike[str], source: SceneSource, count: int, w
         `{"scenes": n, "objects": n, "instances": n}`.
 
     Raises:
-        InputError: `count` is not positive, or the folder holds another data set.
+        InputError: `count` is not positive, or the folder holds another data set, or another process writes there.
     """
     if count < 1:
         raise input_error("number of scenes", got=count, expected="at least 1")
     out = Path(out)
+    with locked(out):
+        sweep(out)
+        return _write(out, source, count, workers)
+
+
+def _write(out: Path, source: SceneSource, count: int, workers: int) -> dict[str, Any]:
     description = {"count": count, **source.describe()}
     made = out / "source.json"
     if made.is_file():
@@ -70,7 +78,7 @@ def write_scenes(out: str | os.PathLike[str], source: SceneSource, count: int, w
                 expected="a new folder, or the same options to resume",
                 do="choose another --out or delete it",
             )
-    elif out.is_dir() and any(out.iterdir()):
+    elif contents(out):
         raise input_error("the folder is not empty", got=out, expected="a new folder", do="choose another --out")
     else:
         write_json(made, description)
@@ -106,10 +114,9 @@ def _join(out: Path, count: int) -> None:
     voxels: dict[str, np.ndarray] = {}
     rows: list[dict[str, Any]] = []
     for first in range(0, count, CHUNK):
-        with np.load(parts / f"{first:06d}.npz", allow_pickle=False) as stored:
-            voxels.update(stored)
+        with Npz(parts / f"{first:06d}.npz") as stored:
+            voxels.update({name: stored.array(name, (VOXELS**3 // 8,)) for name in stored.names})
         rows.extend(row for _, row in read_jsonl(parts / f"{first:06d}.jsonl"))
-    with atomic_path(out / "voxels.npz") as temporary:
-        np.savez_compressed(temporary, **dict(sorted(voxels.items())))  # type: ignore[arg-type]
+    save_npz(out / "voxels.npz", dict(sorted(voxels.items())))
     write_jsonl(out / SCENES, rows)
     shutil.rmtree(parts)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.svi import StepInfo
+from nolbo_ppl.io.fields import is_whole
 from nolbo_ppl.io.files import atomic_path, read_jsonl, write_json
-from nolbo_ppl.io.tensors import load_tensors, save_tensors
+from nolbo_ppl.io.tensors import check_tensors, load_tensors, save_tensors
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.training.stages import StageRun, TrainingStage
 from nolbo_ppl.training.train_config import TrainConfig
@@ -47,19 +51,42 @@ class Journal:
         if not self.config.resume:
             raise input_error("the folder holds a run", got=self.config.out, do="choose another --out, or resume")
         tensors, meta = load_tensors(self.file)
-        if meta.get("identity") != identity:
-            differing = sorted(k for k in identity if identity[k] != meta.get("identity", {}).get(k))
+        stated, number, at_step = meta.get("identity"), meta.get("stage"), meta.get("step")
+        if not isinstance(stated, dict) or not is_whole(number, 0, len(stages)) or not is_whole(at_step):
+            got = f"stage {number!r}, step {at_step!r}"
+            raise input_error("not a checkpoint of a run", got=got, do="delete it to begin anew", file=self.file)
+        if stated != identity:
+            differing = sorted(k for k in {*identity, *stated} if identity.get(k) != stated.get(k))
             raise input_error(
                 "the checkpoint belongs to another configuration",
                 got=f"differing fields {differing}",
                 file=self.file,
                 do="choose another --out, or repeat the run's own options",
             )
-        number, at_step = int(meta["stage"]), int(meta["step"])
+        self._check(model, tensors, at_step)
         self._cut(number, at_step, stages)
         # The networks too: before a stage goes on, the shape guide in them teaches the latents of all shapes.
         model.load_state_dict(optimisation.module_tensors(tensors) if at_step else tensors)
         return number, tensors if at_step else None, at_step
+
+    def _check(self, model: Nolbo, tensors: Mapping[str, Tensor], at_step: int) -> None:
+        """Raise `InputError` for a checkpoint of other networks, or with numbers that are not finite."""
+        own = model.state_dict()
+        if not at_step:
+            return check_tensors(own, tensors, self.file)
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+                raise input_error(f"tensor {name}", got="NaN or infinity", expected="finite numbers", file=self.file)
+        for part in ("model", "average"):
+            check_tensors(own, optimisation.part_of(tensors, f"{part}/"), self.file)
+        shapes = dict(model.named_parameters())
+        for name, tensor in optimisation.part_of(tensors, "optimizer/").items():
+            parameter = shapes.get(name.rpartition("/")[0])
+            if parameter is None or (tensor.dim() and tensor.shape != parameter.shape):
+                got = f"{name} of shape {tuple(tensor.shape)}"
+                raise input_error(
+                    "state of the optimiser", got=got, expected="NAME/KEY of a parameter, in its shape", file=self.file
+                )
 
     def _cut(self, number: int, at_step: int, stages: Sequence[TrainingStage]) -> None:
         """Drop the rows of metrics that were written after the checkpoint: they will be written again."""
@@ -67,7 +94,11 @@ class Journal:
             return
         order = {stage.name: i for i, stage in enumerate(stages)}
         rows = _complete_rows(self.path)
-        kept = [row for row in rows if (order.get(row["stage"], 0), row["step"]) <= (number, at_step)]
+        for line, row in rows:
+            if row.get("stage") not in order or not is_whole(row.get("step")):
+                got = f"stage {row.get('stage')!r}, step {row.get('step')!r}"
+                raise input_error("not a row of this run", got=got, file=self.path, line=line)
+        kept = [row for _, row in rows if (order[row["stage"]], row["step"]) <= (number, at_step)]
         with atomic_path(self.path) as temporary:
             temporary.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
 
@@ -113,10 +144,10 @@ class Journal:
             self._board.close()
 
 
-def _complete_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of metrics; the last line may have been cut when the process was killed."""
-    *whole, last = path.read_text(encoding="utf-8").split("\n")
+def _complete_rows(path: Path) -> list[tuple[int, dict[str, Any]]]:
+    """Lines and rows of metrics; the last line may have been cut when the process was killed."""
+    *whole, last = path.read_bytes().split(b"\n")
     if last:
         with atomic_path(path) as temporary:
-            temporary.write_text("".join(line + "\n" for line in whole), encoding="utf-8")
-    return [row for _, row in read_jsonl(path)]
+            temporary.write_bytes(b"".join(line + b"\n" for line in whole))
+    return list(read_jsonl(path))

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import atomic_path, write_json
+from nolbo_ppl.io.files import write_json
+from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.observations import Detections, write_observations
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, write_trajectory
 
@@ -46,8 +47,7 @@ def write_converted(out: str | PathLike[str], data: Converted) -> None:
     write_trajectory(out / "odometry.txt", data.odometry)
     write_trajectory(out / "truth.txt", data.truth)
     if data.odometry_covariance is not None:
-        with atomic_path(out / COVARIANCE) as temporary:
-            np.savez_compressed(temporary, covariance=data.odometry_covariance)
+        save_npz(out / COVARIANCE, {"covariance": data.odometry_covariance})
     write_observations(out / "observations.jsonl", data.observations)
     write_json(
         out / "objects.json",

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.data.simulate import DetectorConfig, SimulatedWorld, simulate_detections
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.npz import read_npy
 from nolbo_ppl.io.observations import make_table
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
 
@@ -54,7 +55,7 @@ def convert_kitti_poles(
     folder = Path(data)
     truth = read_trajectory(existing(folder / "poses" / f"{sequence}.txt", "true poses")).T_world_camera
     drift = read_trajectory(existing(folder / odometry / f"{sequence}.txt", "odometry")).T_world_camera
-    poles = np.load(existing(folder / "poles" / f"{sequence}.npy", "pole map"), allow_pickle=False)
+    poles = read_npy(existing(folder / "poles" / f"{sequence}.npy", "pole map"), (None, None))
     if len(truth) != len(drift):
         raise input_error("odometry and truth have different lengths", got=(len(drift), len(truth)), file=folder)
     world = pole_positions(np.asarray(poles, dtype=np.float64), truth)

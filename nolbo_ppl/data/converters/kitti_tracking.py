@@ -12,6 +12,7 @@ from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.data.simulate import simulate_odometry
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
+from nolbo_ppl.io.npz import read_npz
 from nolbo_ppl.io.observations import make_table
 from nolbo_ppl.io.trajectories import Trajectory
 
@@ -125,7 +126,7 @@ def convert_kitti_tracking(
         InputError: files are missing or malformed.
     """
     folder = Path(data)
-    ego = np.load(existing(folder / "pseudo_ego" / f"{sequence}.npz", "pseudo ego motion"), allow_pickle=False)
+    ego = read_npz(existing(folder / "pseudo_ego" / f"{sequence}.npz", "pseudo ego motion"), {"P": None, "cov": None})
     truth = planar_poses(ego["P"])
     trusted = ego["cov"] >= 1
     first, last = longest_run(trusted) if trusted_only else (0, len(truth))

@@ -10,6 +10,7 @@ import numpy as np
 from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import chain, make_pose, nearest_rotation, quaternion_to_matrix, relative, se3_exp, so3_log
+from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.io.observations import make_table
 from nolbo_ppl.io.trajectories import Trajectory
 
@@ -60,8 +61,10 @@ def convert_ycbv_slam(
         InputError: the file is missing or holds no such detections.
     """
     path = existing(Path(data) / f"{sequence}.npz", "sequence")
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    with Npz(path) as file:
+        arrays = {
+            name: file.array(name, kinds="fiub", finite=False) for name in file.names if file.headers[name].dtype.kind != "U"
+        }
     names = sorted(name.split("/", 1)[1] for name in arrays if name.startswith(f"{detections}/"))
     if not names:
         raise input_error(

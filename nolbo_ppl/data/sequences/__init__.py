@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder, read_lengths, read_times
+from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder
 from nolbo_ppl.data.sequences.opening import open_frames
 from nolbo_ppl.data.sequences.undistorted import UndistortedFrames, guessed_camera, without_distortion
 from nolbo_ppl.data.sequences.video import VideoFile
 from nolbo_ppl.io.camera_files import CameraIntrinsics, read_camera, read_intrinsics, write_camera
+from nolbo_ppl.io.text import read_lengths, read_times
 
 __all__ = [
     "CameraIntrinsics",

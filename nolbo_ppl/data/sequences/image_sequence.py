@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.files import inside
 from nolbo_ppl.io.images import IMAGE_SUFFIXES, image_size, list_images, open_depth_image, open_image
 from nolbo_ppl.io.text import read_words
 from nolbo_ppl.io.trajectories import match_times
@@ -78,51 +79,6 @@ class FrameSequence(ABC):
 
 
 list_frames = list_images  # its name of 0.1.0
-
-
-def read_column(path: str | PathLike[str], what: str) -> list[tuple[int, float]]:
-    """Line numbers and values of a file with one finite number a line; blank lines and `#` comments are skipped.
-
-    Raises:
-        InputError: the file is missing or empty, or a line holds anything else; names file and line.
-    """
-    path = Path(path)
-    rows = []
-    for number, words in read_words(path):
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != 1 or not np.isfinite(values[0]):
-            raise input_error(f"not {what}", got=repr(" ".join(words)[:80]), expected="one number", file=path, line=number)
-        rows.append((number, values[0]))
-    if not rows:
-        raise input_error("the file is empty", expected=f"{what} a line", file=path)
-    return rows
-
-
-def read_times(path: str | PathLike[str]) -> Float[np.ndarray, " n"]:
-    """Times in s, one a line (`times.txt` of KITTI). Raises `InputError` naming the line, also where time stands still."""
-    rows = read_column(path, "a time in seconds")
-    times = np.array([value for _, value in rows])
-    backwards = np.diff(times) <= 0
-    if backwards.any():
-        number, value = rows[int(np.argmax(backwards)) + 1]
-        raise input_error("time does not increase", got=value, file=path, line=number)
-    return times
-
-
-def read_lengths(path: str | PathLike[str]) -> Float[np.ndarray, " n"]:
-    """Lengths of steps in m, one a line: line k is the way from frame k - 1 to frame k, frames counted from 0.
-
-    Raises:
-        InputError: malformed or negative lengths; names file and line.
-    """
-    rows = read_column(path, "a length in metres")
-    for number, value in rows:
-        if value < 0:
-            raise input_error("negative length", got=value, expected="metres from one frame to the next", file=path, line=number)
-    return np.array([value for _, value in rows])
 
 
 def read_image(path: Path, file: Path | None = None, line: int | None = None) -> UInt8[np.ndarray, "h w 3"]:
@@ -204,7 +160,9 @@ def read_listing(path: Path) -> tuple[list[int], Float[np.ndarray, " n"], list[P
             )
         if times and stamp <= times[-1]:
             raise input_error("time does not increase", got=words[0], file=path, line=number)
-        file = path.parent / words[1]
+        file = inside(path.parent, words[1], follow=True)
+        if file is None:
+            raise input_error("image outside of the folder", got=words[1], do="link it into the folder", file=path, line=number)
         if not file.is_file():
             raise input_error("no such image", got=words[1], file=path, line=number)
         lines.append(number)

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder, list_frames, read_times
+from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder, list_frames
 from nolbo_ppl.data.sequences.video import VIDEO_SUFFIXES, VideoFile
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.text import read_times
 
 IMAGE_FOLDERS = ("image_2", "image_0", "image_02", "images", "rgb", "data")
 """Folders inside the given one that hold its images, in this order of preference (KITTI's left colour camera first)."""

@@ -7,10 +7,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from nolbo_ppl.errors import input_error
+import torch
+
+from nolbo_ppl.errors import InputError, input_error, located
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.files import read_json, write_json
-from nolbo_ppl.io.tensors import load_strictly, load_tensors, save_tensors
+from nolbo_ppl.io.tensors import check_tensors, file_hash, load_strictly, load_tensors, save_tensors
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
@@ -33,13 +35,25 @@ def load(name_or_path: str | PathLike[str] = "tiny") -> ObservationModel:
             got=repr(str(name_or_path)),
             expected=f"one of {names}, or a folder with config.json and model.safetensors",
         )
-    values = read_json(folder / "config.json")
+    file, weights = folder / "config.json", folder / "model.safetensors"
+    values = read_json(file)
     if not isinstance(values, dict) or "model" not in values:
-        raise input_error("not a model configuration", expected='{"model": {...}, ...}', file=folder / "config.json")
-    model = Nolbo.from_seed(ModelConfig.from_json(values["model"]), seed=0)
-    tensors, _ = load_tensors(folder / "model.safetensors")
-    load_strictly(model, tensors, folder / "model.safetensors")
-    return ObservationModel(model, Calibration.from_json(values.get("calibration", {})))
+        raise input_error("not a model configuration", expected='{"model": {...}, ...}', file=file)
+    tensors, _ = load_tensors(weights)
+    stated = values.get("sha256")
+    if stated is not None and stated != file_hash(weights):
+        expected = f"SHA-256 {stated}, as config.json says"
+        raise input_error("weights were changed", got=file_hash(weights), expected=expected, file=weights)
+    try:
+        config = ModelConfig.from_json(values["model"])
+        calibration = Calibration.from_json(values.get("calibration", {}))
+        with torch.device("meta"):  # shapes alone: a configuration of networks beyond any memory does not fit its weights
+            check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
+    except InputError as error:
+        raise (error if str(weights) in str(error) else located(error, file)) from None
+    model = Nolbo.from_seed(config, seed=0)
+    load_strictly(model, tensors, weights)
+    return ObservationModel(model, calibration)
 
 
 def save(folder: str | PathLike[str], model: Nolbo, calibration: Calibration, meta: dict[str, Any], half: bool = False) -> None:
@@ -58,4 +72,5 @@ def save(folder: str | PathLike[str], model: Nolbo, calibration: Calibration, me
         for name, value in model.state_dict().items()
     }
     save_tensors(folder / "model.safetensors", tensors, {"format": 1})
-    write_json(folder / "config.json", {"model": model.config.to_json(), "calibration": calibration.to_json(), **meta})
+    described = {"model": model.config.to_json(), "calibration": calibration.to_json()}
+    write_json(folder / "config.json", {**described, "sha256": file_hash(folder / "model.safetensors"), **meta})

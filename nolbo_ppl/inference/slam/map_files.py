@@ -17,10 +17,28 @@ from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.hypotheses import ambiguity
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, write_voxels
 from nolbo_ppl.inference.slam.slam_result import SlamResult
-from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
+from nolbo_ppl.io.files import read_json_object, write_json, write_jsonl
+from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, known_rows, relative_pose_error
 from nolbo_ppl.structures.landmark import Landmark
+
+RESULT = (
+    "trajectory.txt",
+    "landmarks.json",
+    "landmarks_voxels.npz",
+    "associations.jsonl",
+    "iterations.npz",
+    "summary.json",
+    "map.png",
+)
+"""Files of a result of SLAM."""
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder holds a result of SLAM, which another may replace."""
+    file = folder / "summary.json"
+    return file.is_file() and {"loop_pairs", "configuration", "versions"} <= set(read_json_object(file))
 
 
 def landmark_row(landmark: Landmark) -> dict[str, Any]:
@@ -104,8 +122,7 @@ def write_iterations(path: str | PathLike[str], history: Sequence[SlamEstimate])
     """
     arrays = {f"landmarks_{i}": x.T_world_landmark[:, :3, 3].astype(np.float32) for i, x in enumerate(history)}
     poses = np.stack([x.T_world_camera for x in history]).astype(np.float32)
-    with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, T_world_camera=poses, **arrays)  # type: ignore[arg-type]
+    save_npz(path, {"T_world_camera": poses, **arrays})
 
 
 def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, Any]:

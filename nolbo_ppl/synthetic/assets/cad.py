@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,9 @@ from tqdm import tqdm
 
 from nolbo_ppl.errors import NolboError, input_error
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
-from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.files import read_json_object
 from nolbo_ppl.io.images import is_passed_over
+from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
 from nolbo_ppl.synthetic.assets.obj_file import read_obj
@@ -185,33 +185,18 @@ def _read_mesh(file: Path) -> tuple[Vertices, Faces]:
 
 def _load_archive(folder: Path, wanted: set[str] | None, diagonals: Mapping[str, float] | None) -> Iterator[Shape]:
     """Yield the shapes of an archive with ready voxels (see `load_cad_folder`)."""
-    meta = read_json(folder / "meta.json")
+    meta = read_json_object(folder / "meta.json")
     mesh_file, voxel_file = folder / "meshes.npz", folder / "voxels64.npz"
     try:
-        # Opened here, since numpy leaves a file that is no archive open.
-        with (
-            mesh_file.open("rb") as mesh_bytes,
-            voxel_file.open("rb") as voxel_bytes,
-            np.load(mesh_bytes, allow_pickle=False) as meshes,
-            np.load(voxel_bytes, allow_pickle=False) as grids,
-        ):
-            row = {str(name): i for i, name in enumerate(grids["names"])}
-            solids = grids["solid"]
+        with Npz(mesh_file) as meshes, Npz(voxel_file) as grids:
+            row = {str(name): i for i, name in enumerate(grids.array("names", kinds="U"))}
+            solids = grids.array("solid")
             for name, info in meta.items():
                 if wanted is None or info["category"] in wanted:
                     yield _archive_shape(name, info, meshes, solids[row[name]], diagonals, mesh_file)
     except NolboError:
         raise
-    except (
-        KeyError,
-        IndexError,
-        zipfile.BadZipFile,
-        OSError,
-        EOFError,
-        TypeError,
-        AttributeError,
-        ValueError,
-    ) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise input_error(
             "malformed CAD archive",
             got=f"{type(error).__name__}: {error}",
@@ -223,14 +208,14 @@ def _load_archive(folder: Path, wanted: set[str] | None, diagonals: Mapping[str,
 def _archive_shape(
     name: str,
     info: Mapping[str, Any],
-    meshes: Mapping[str, np.ndarray],
+    meshes: Npz,
     packed: np.ndarray,
     diagonals: Mapping[str, float] | None,
     file: Path,
 ) -> Shape:
     """Make one shape of an archive; its voxels follow the surface where that is moved by half a voxel or more."""
-    vertices = meshes[f"{name}_v"].astype(np.float64)
-    faces = meshes[f"{name}_f"].astype(np.int64)
+    vertices = meshes.array(f"{name}_v", (None, 3)).astype(np.float64)
+    faces = meshes.array(f"{name}_f", (None, 3)).astype(np.int64)
     solid = GridSolid(packed, ARCHIVE_VOXELS)
     box = np.array([info["bbox_min"], info["bbox_max"]])
     missed = np.inf if len(vertices) == 0 else np.abs(np.stack([vertices.min(0), vertices.max(0)]) - box).max()

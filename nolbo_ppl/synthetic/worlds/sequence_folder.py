@@ -23,6 +23,8 @@ from nolbo_ppl._version import __version__
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
 from nolbo_ppl.io.images import open_image
+from nolbo_ppl.io.npz import save_npz
+from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.synthetic.worlds.world import World, make_world
@@ -104,9 +106,15 @@ def write_drive(config: DriveConfig, out: str | os.PathLike[str], workers: int =
         workers: processes; the files do not depend on it.
 
     Raises:
-        InputError: the folder holds something else.
+        InputError: the folder holds something else, or another process writes into it.
     """
     out = Path(out)
+    with locked(out):
+        sweep(out)
+        return _write(config, out, workers)
+
+
+def _write(config: DriveConfig, out: Path, workers: int) -> DriveSummary:
     made = {"layout": LAYOUT, "config": _plain(config)}
     known = out / DRIVE
     if known.is_file():
@@ -118,7 +126,7 @@ def write_drive(config: DriveConfig, out: str | os.PathLike[str], workers: int =
                 expected="a new folder, or the same options to resume",
                 do="choose another --out or delete it",
             )
-    elif out.is_dir() and any(out.iterdir()):
+    elif contents(out):
         raise input_error("the folder is not empty", got=out, expected="a new folder", do="choose another --out")
     if not (out / SCENES).is_file():
         world = _world(config)
@@ -151,8 +159,7 @@ def _write_truth(world: World, out: Path) -> None:
         temporary.write_text("".join(f"{t:.6f}\n" for t in world.times), encoding="utf-8")
     write_json(out / OBJECTS, [describe_object(world, k) for k in range(len(world.objects))])
     items = {thing.look.item.shape.instance: thing.look.item for thing in world.objects}
-    with atomic_path(out / VOXELS) as temporary:
-        np.savez_compressed(temporary, **{name: item.voxels for name, item in sorted(items.items())})  # type: ignore[arg-type]
+    save_npz(out / VOXELS, {name: item.voxels for name, item in sorted(items.items())})
 
 
 def _render_missing(config: DriveConfig, out: Path, workers: int) -> None:

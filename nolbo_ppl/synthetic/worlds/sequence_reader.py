@@ -13,8 +13,12 @@ from jaxtyping import Float, UInt8
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation
-from nolbo_ppl.io.files import read_json, read_jsonl
+from nolbo_ppl.io.camera_files import read_camera
+from nolbo_ppl.io.fields import is_number, is_whole, number_array
+from nolbo_ppl.io.files import read_json, read_json_object, read_jsonl
+from nolbo_ppl.io.npz import read_voxels
 from nolbo_ppl.io.scenes import ObjectRecord, image_field, parse_record
+from nolbo_ppl.io.text import read_times
 from nolbo_ppl.io.trajectories import read_trajectory
 from nolbo_ppl.synthetic.worlds.sequence_folder import DRIVE, INTRINSICS, OBJECTS, SCENES, TIMES, TRUTH, VOXELS, read_image
 
@@ -70,16 +74,7 @@ class SequenceFolder:
 
     def voxels(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         """Packed 32^3 occupancy of each instance; see `nolbo_ppl.geometry.voxels.unpack_voxels`."""
-        with np.load(self.path / VOXELS, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-
-
-def _numbers(value: object, shape: tuple[int, ...]) -> np.ndarray | None:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return array if array.shape == shape and np.isfinite(array).all() else None
+        return read_voxels(self.path / VOXELS)
 
 
 def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
@@ -98,19 +93,22 @@ def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
             raise input_error(where + "id", got=row, expected='an object with a name "id"', file=path)
         if row.get("category") not in CATEGORIES:
             raise input_error(where + "category", got=row.get("category"), expected=", ".join(CATEGORIES), file=path)
-        T = _numbers(row.get("T_world_object"), (4, 4))
+        T = number_array(row.get("T_world_object"), (4, 4))
         if T is None or not bool(is_rotation(T[:3, :3], tolerance=1e-3)):
             raise input_error(where + "T_world_object", got=row.get("T_world_object"), expected="a 4 x 4 pose", file=path)
-        dimensions, diagonal = _numbers(row.get("dimensions"), (3,)), _numbers(row.get("diagonal"), ())
-        if dimensions is None or diagonal is None or diagonal <= 0:
+        dimensions, diagonal = number_array(row.get("dimensions"), (3,)), row.get("diagonal")
+        if dimensions is None or (dimensions <= 0).any() or not is_number(diagonal, 1e-9):
             got = f"{row.get('dimensions')}, {row.get('diagonal')}"
             raise input_error(where + "dimensions, diagonal", got=got, expected="metres", file=path)
+        symmetry = row.get("symmetry", 1)
+        if not is_whole(symmetry):
+            raise input_error(where + "symmetry", got=symmetry, expected="1 none, n n-fold, 0 free", file=path)
         found.append(
             DriveObject(
                 row["id"],
                 row["category"],
                 str(row.get("instance", "")),
-                int(row.get("symmetry", 1)),
+                symmetry,
                 T,
                 float(diagonal),
                 dimensions,
@@ -136,26 +134,19 @@ def read_drive(path: str | os.PathLike[str]) -> SequenceFolder:
             expected=f"a folder with {DRIVE} and {SCENES}",
             do="write it with nolbo drive --out, which also resumes a drive that was stopped",
         )
-    camera = read_json(path / INTRINSICS)
-    try:
-        intrinsics = np.array([float(camera[name]) for name in ("fx", "fy", "cx", "cy")])
-        size = (int(camera["width"]), int(camera["height"]))
-    except (KeyError, TypeError, ValueError):
-        raise input_error(
-            "intrinsics", got=camera, expected='{"fx", "fy", "cx", "cy", "width", "height"}', file=path / INTRINSICS
-        ) from None
+    camera = read_camera(path / INTRINSICS)
+    if camera.width is None or camera.height is None:
+        raise input_error("intrinsics without the images' size", expected='"width" and "height"', file=path / INTRINSICS)
+    intrinsics, size = camera.vector, (camera.width, camera.height)
     objects = read_objects(path / OBJECTS)
     poses = read_trajectory(path / TRUTH).T_world_camera
-    try:
-        times = np.loadtxt(path / TIMES, ndmin=1)
-    except (OSError, ValueError) as error:
-        raise input_error("times", got=error, expected="one number a line", file=path / TIMES) from None
+    times = read_times(path / TIMES)
     frames = tuple(_frames(path, size, {thing.id for thing in objects}))
     if not len(frames) == len(poses) == len(times):
         raise input_error(
             "lengths differ", got=f"{len(frames)} frames, {len(poses)} poses, {len(times)} times", expected="equal", file=path
         )
-    return SequenceFolder(path, intrinsics, size, poses, times, objects, frames, read_json(path / DRIVE))
+    return SequenceFolder(path, intrinsics, size, poses, times, objects, frames, read_json_object(path / DRIVE))
 
 
 def _frames(path: Path, size: tuple[int, int], known: set[str]) -> list[DriveFrame]:
