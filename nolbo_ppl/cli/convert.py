@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,9 @@ from nolbo_ppl.data.converters import (
     read_photographs,
     write_converted,
 )
+from nolbo_ppl.io.files import read_json_object
+from nolbo_ppl.io.output_folder import output_folder
+from nolbo_ppl.io.trajectories import COVARIANCE
 
 
 @dataclass(frozen=True)
@@ -178,15 +182,26 @@ Source = (
 )
 
 
+DRIVE = ("odometry.txt", "truth.txt", COVARIANCE, "observations.jsonl", "objects.json", "source.json")
+SCENES = ("images", "scenes.jsonl", "voxels.npz", "source.json")
+"""Files of what is converted."""
+
+
+def is_converted(folder: Path) -> bool:
+    """Whether a folder holds converted data that others may replace; generated scenes state no kind."""
+    return (folder / "source.json").is_file() and "kind" in read_json_object(folder / "source.json")
+
+
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
     source: Any = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
-    if hasattr(source, "write"):
-        written = source.write()
-    else:
-        data = source.convert()
-        write_converted(source.out, data)
-        written = f"{len(data.odometry)} frames, {len(data.observations)} observations"
+    with output_folder(source.out, SCENES if hasattr(source, "write") else DRIVE, is_own=is_converted) as folder:
+        if hasattr(source, "write"):
+            written = dataclasses.replace(source, out=folder).write()
+        else:
+            data = source.convert()
+            write_converted(folder, data)
+            written = f"{len(data.odometry)} frames, {len(data.observations)} observations"
     sys.stdout.write(f"{written} written to {source.out}\n")
 
 

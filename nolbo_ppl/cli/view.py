@@ -13,6 +13,7 @@ import tyro
 
 from nolbo_ppl.report.run_folder import read_run
 from nolbo_ppl.report.viewer import build_viewer, viser_module
+from nolbo_ppl.report.viewer_guard import guarded_server
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class ViewArguments:
     """Trajectory before the correction, where the folder has no odometry.txt."""
     truth: Path | None = None
     """True trajectory, where the folder has no truth.txt."""
+    images: Path | None = None
+    """Folder of the images, where they lie outside of the run's folder; no picture from elsewhere is shown."""
 
 
 def run(arguments: ViewArguments, stop: threading.Event | None = None) -> None:
@@ -39,13 +42,16 @@ def run(arguments: ViewArguments, stop: threading.Event | None = None) -> None:
     Raises:
         InputError: no result in the folder, a malformed file, or viser is not installed.
     """
-    viser = viser_module()
-    found = read_run(arguments.run_dir, odometry=arguments.odometry, truth=arguments.truth)
-    server = viser.ViserServer(host=arguments.host, port=arguments.port, verbose=False)
+    viser_module()  # a word about it first, where it is not installed
+    found = read_run(arguments.run_dir, odometry=arguments.odometry, truth=arguments.truth, pictures=arguments.images)
+    server, guard = guarded_server(arguments.host, arguments.port)
     try:
         build_viewer(found, server)
-        address = f"http://{'localhost' if arguments.host in ('0.0.0.0', '127.0.0.1') else arguments.host}:{server.get_port()}"
-        sys.stdout.write(f"{address}\nCtrl-C ends it.\n")
+        name = "localhost" if arguments.host in ("0.0.0.0", "127.0.0.1") else arguments.host
+        address = f"http://{name}:{server.get_port()}/?token={guard.token}"
+        if found.images and not any(found.images):
+            sys.stdout.write("pictures lie outside of the run's folder and are not shown: --images FOLDER shows them\n")
+        sys.stdout.write(f"{address}\nCtrl-C ends it. Who has this address sees the run.\n")
         sys.stdout.flush()
         if arguments.browser:
             webbrowser.open(address)

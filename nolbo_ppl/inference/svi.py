@@ -105,7 +105,8 @@ def step(state: OptimisationState, *args: Any, **kwargs: Any) -> tuple[Optimisat
     """One optimiser step on a batch; the state is changed in place and returned.
 
     Raises:
-        NolboError: the loss is not finite; the message names the terms that are not. The weights are left as they were.
+        NolboError: the loss is not finite; the message names the terms that are not, and the weights are left as they were. Or
+            the step itself has made weights that are not finite.
     """
     config = state.config
     rate = learning_rate(config, state.step)
@@ -122,6 +123,8 @@ def step(state: OptimisationState, *args: Any, **kwargs: Any) -> tuple[Optimisat
     if not bool(torch.isfinite(norm)):
         raise NolboError(f"gradient of step {state.step} is not finite (loss {float(result.loss.detach()):.3f})")
     state.optimizer.step()
+    if not bool(torch.isfinite(torch.stack(torch._foreach_norm([p.detach() for p in parameters]))).all()):
+        raise NolboError(f"weights after step {state.step} are not finite: is the learning rate of {rate:g} too large?")
     _update_average(state)
     terms = {name: float(value.detach()) for name, value in result.terms.items()}
     info = StepInfo(state.step, float(result.loss.detach()), float(norm), rate, terms)

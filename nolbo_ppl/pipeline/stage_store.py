@@ -14,7 +14,9 @@ from typing import Any
 from tqdm import tqdm
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import read_json, write_json
+from nolbo_ppl.io.fields import is_number
+from nolbo_ppl.io.files import read_json_object, write_json
+from nolbo_ppl.io.output_folder import contents, locked, sweep
 
 RECORD = "run.json"
 """What a run folder says of itself."""
@@ -87,7 +89,7 @@ def recorded(folder: Path) -> dict[str, Any]:
         InputError: the folder holds something else than a run.
     """
     if not (folder / RECORD).is_file():
-        if folder.is_dir() and any(folder.iterdir()):
+        if contents(folder):
             raise input_error(
                 "the folder holds something else than a run",
                 expected="a run, an empty folder, or none",
@@ -95,8 +97,8 @@ def recorded(folder: Path) -> dict[str, Any]:
                 file=folder,
             )
         return {}
-    values = read_json(folder / RECORD)
-    if not isinstance(values, dict) or not isinstance(values.get("fingerprints"), dict):
+    values = read_json_object(folder / RECORD)
+    if not isinstance(values.get("fingerprints"), dict):
         raise input_error("not the record of a run", file=folder / RECORD, do="choose another --out")
     return values
 
@@ -129,20 +131,26 @@ def run_stages(
         cpu_seconds: the same, processor time.
 
     Raises:
-        InputError: the folder holds something else than a run.
+        InputError: the folder holds something else than a run, or another process writes into it.
     """
+    with locked(folder):
+        sweep(folder)
+        return _run(folder, stages, RunRecord(configuration, versions, seconds, cpu_seconds))
+
+
+def _run(folder: Path, stages: Sequence[PipelineStage], record: RunRecord) -> RunRecord:
     before = recorded(folder)
     wanted = fingerprints(stages)
-    record = RunRecord(configuration, versions, seconds, cpu_seconds)
     first = 0
     for stage in stages:
         if before.get("fingerprints", {}).get(stage.name) != wanted[stage.name] or not stage.complete(folder):
             break
         record.fingerprints[stage.name] = wanted[stage.name]
         for kept, name in ((record.seconds, "seconds"), (record.cpu_seconds, "cpu_seconds")):
-            kept[stage.name] = float(before.get(name, {}).get(stage.name, 0.0))
+            known = before.get(name)
+            value = known.get(stage.name) if isinstance(known, dict) else None
+            kept[stage.name] = float(value) if is_number(value, 0) else 0.0
         first += 1
-    folder.mkdir(parents=True, exist_ok=True)
     record.write(folder)
     for stage in stages[first:]:
         stage.remove(folder)

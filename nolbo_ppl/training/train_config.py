@@ -27,6 +27,10 @@ OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix"
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
+LARGEST_RATE = 10.0
+"""Learning rates above throw every weight away at the first step."""
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Everything a training run depends on."""
@@ -167,6 +171,22 @@ class TrainConfig:
                 expected=f"a multiple of average_every, {self.average_every}",
                 do="a run goes on exactly only from where the weights of all processes were averaged",
             )
+        for name in (
+            "shape_steps",
+            "single_steps",
+            "scene_steps",
+            "single_count",
+            "decode",
+            "threads",
+            "evaluate_scenes",
+            "seed",
+        ):
+            if getattr(self, name) < 0:
+                raise input_error(name, got=getattr(self, name), expected="at least 0")
+        if not 0 < self.learning_rate <= LARGEST_RATE:
+            raise input_error("learning_rate", got=self.learning_rate, expected=f"above 0, at most {LARGEST_RATE:g}")
+        if not all(0 <= weight < 1e9 for weight in self.weights.values()):
+            raise input_error("weights", got=self.weights, expected="finite numbers of at least 0")
         if not 0 <= self.freeze <= 1:
             raise input_error("freeze", got=self.freeze, expected="a share from 0 to 1")
         if any(size % 32 or size <= 0 for size in self.sizes):

@@ -31,7 +31,7 @@ from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.stage_data import TrainingData
 from nolbo_ppl.training.stages import StageRun
 from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
-from nolbo_ppl.training.training_log import Journal
+from nolbo_ppl.training.training_log import Journal, run_folder
 from nolbo_ppl.training.validation import held_out
 
 
@@ -55,10 +55,16 @@ def run(config: TrainConfig) -> TrainSummary:
     """Train as configured; returns when the model is written.
 
     Raises:
-        InputError: the configuration or the data cannot be used, or the folder holds a run of another configuration.
+        InputError: the configuration or the data cannot be used, or the folder holds a run of another configuration or
+            something else, or another process writes into it.
     """
-    started = time.perf_counter()
     rank, world = _join()
+    with run_folder(config.out) if rank == 0 else nullcontext():
+        return _run(config, rank, world)
+
+
+def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
+    started = time.perf_counter()
     if config.threads:
         torch.set_num_threads(config.threads)
     data = TrainingData(config, rank, world)

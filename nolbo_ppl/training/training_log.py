@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,42 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.svi import StepInfo
 from nolbo_ppl.io.fields import is_whole
-from nolbo_ppl.io.files import atomic_path, read_jsonl, write_json
+from nolbo_ppl.io.files import atomic_path, read_json_object, read_jsonl, write_json
+from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.io.tensors import check_tensors, load_tensors, save_tensors
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.training.stages import StageRun, TrainingStage
 from nolbo_ppl.training.train_config import TrainConfig
+
+FILES = frozenset({"metrics.jsonl", "checkpoint.safetensors", "config.json", "model", "tensorboard"})
+"""What a run writes into its folder."""
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run: the configuration of a model is another file of the same name."""
+    file = folder / "config.json"
+    return file.is_file() and {"out", "scene_steps"} <= set(read_json_object(file))
+
+
+@contextmanager
+def run_folder(folder: Path) -> Iterator[None]:
+    """Hold the folder of a run; what a killed process left in it is deleted.
+
+    Raises:
+        InputError: the folder holds something else under a name that a run writes, or another process writes into it.
+    """
+    with locked(folder):
+        sweep(folder)
+        taken = sorted({*contents(folder)} & FILES)
+        if taken and not is_run(folder):
+            raise input_error(
+                "the folder holds something else than a run",
+                got=", ".join(taken),
+                expected="a run, or a folder without files of these names",
+                do="choose another --out",
+                file=folder,
+            )
+        yield
 
 
 class Journal:

@@ -21,7 +21,7 @@ from nolbo_ppl.data.converters.converted import existing
 from nolbo_ppl.data.converters.kitti_tracking import car_rotation
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.rotation import matrix_to_quaternion
-from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
+from nolbo_ppl.io.files import atomic_path, read_text, write_json, write_jsonl
 from nolbo_ppl.io.images import image_size, images_of
 from nolbo_ppl.synthetic.dataset_writer import SCENES
 
@@ -71,7 +71,7 @@ CAMERAS = {
 
 def read_calibration(path: str | PathLike[str]) -> KittiCamera:
     """Camera 2 of a calibration file. Raises `InputError` naming file and line."""
-    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in enumerate(read_text(path).splitlines(), start=1):
         name, _, rest = text.partition(":")
         if name.strip() != "P2":
             continue
@@ -107,7 +107,7 @@ class KittiLabel:
 def read_object_labels(path: str | PathLike[str]) -> list[KittiLabel]:
     """The labels of an image. Raises `InputError` naming file and line."""
     labels = []
-    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in enumerate(read_text(path).splitlines(), start=1):
         words = text.split()
         if not words:
             continue

@@ -12,6 +12,7 @@ from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.data.simulate import simulate_odometry
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
+from nolbo_ppl.io.files import read_text
 from nolbo_ppl.io.npz import read_npz
 from nolbo_ppl.io.observations import make_table
 from nolbo_ppl.io.trajectories import Trajectory
@@ -46,7 +47,7 @@ def car_rotation(rotation_y: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 
 def read_detections(path: str | PathLike[str]) -> Float[np.ndarray, "k 15"]:
     """Rows: frame, type, x1 y1 x2 y2, score, h w l, x y z, rotation_y, alpha. Raises `InputError` naming the line."""
     rows = []
-    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in enumerate(read_text(path).splitlines(), start=1):
         if not text.strip():
             continue
         try:
@@ -62,7 +63,7 @@ def read_detections(path: str | PathLike[str]) -> Float[np.ndarray, "k 15"]:
 def read_labels(path: str | PathLike[str]) -> tuple[Int[np.ndarray, "k 2"], Float[np.ndarray, "k 4"], list[str]]:
     """Frame and track, position of the box centre and rotation_y, and type of every labelled object."""
     numbers, poses, kinds = [], [], []
-    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in enumerate(read_text(path).splitlines(), start=1):
         words = text.split()
         if not words:
             continue

@@ -24,6 +24,7 @@ from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage, ArchiveObject
 from nolbo_ppl.data.converters.voc import known_category
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.files import read_text
 
 IMAGE_SUFFIXES = (".JPEG", ".jpg", ".jpeg", ".png", ".JPG")
 
@@ -139,7 +140,7 @@ def read_pascal3d_annotation(
 def _listed(file: Path) -> list[str]:
     if not file.is_file():
         raise input_error("no such split", expected="a list of image names", file=file)
-    return [line.split()[0] for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    return [line.split()[0] for line in read_text(file).splitlines() if line.strip()]
 
 
 def read_pascal3d(

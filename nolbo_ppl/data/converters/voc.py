@@ -10,6 +10,7 @@ from pathlib import Path
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage, ArchiveObject
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.files import read_text
 
 RENAMED = {
     "airplane": "aeroplane",
@@ -123,9 +124,7 @@ def read_voc(
         listing = root / "ImageSets" / "Main" / f"{split}.txt"
         if not listing.is_file():
             raise input_error("no such split", got=split, expected="a file of ImageSets/Main", file=listing)
-        files = [
-            annotations / f"{line.split()[0]}.xml" for line in listing.read_text(encoding="utf-8").splitlines() if line.strip()
-        ]
+        files = [annotations / f"{line.split()[0]}.xml" for line in read_text(listing).splitlines() if line.strip()]
     if not files:
         raise input_error("a folder without annotations", file=annotations)
     for file in files:
