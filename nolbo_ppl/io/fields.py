@@ -53,12 +53,13 @@ def number_array(value: Any, shape: tuple[int | None, ...], largest: float = LAR
     return array if array.ndim == len(shape) else None
 
 
-def check_fields(cls: type, values: Mapping[str, Any], most: int, most_of: Mapping[str, int]) -> dict[str, Any]:
+def check_fields(cls: type, values: Mapping[str, Any], what: str, most: int, most_of: Mapping[str, int]) -> dict[str, Any]:
     """Values of a JSON object for a dataclass of flat fields; lists become tuples.
 
     Args:
         cls: the dataclass; its fields are bool, int, float, str, `Literal`, or tuples of one of them.
         values: what the file holds.
+        what: what it is, for the messages.
         most: greatest whole number of any field, and longest list; numbers are 1e6 at most.
         most_of: greatest whole number by field, where it is another.
 
@@ -69,12 +70,12 @@ def check_fields(cls: type, values: Mapping[str, Any], most: int, most_of: Mappi
     names = [field.name for field in dataclasses.fields(cls)]
     unknown = sorted(set(values) - set(names))
     if unknown:
-        raise input_error("unknown field", got=unknown, expected=f"some of {names}")
+        raise input_error(f"unknown fields of {what}", got=unknown, expected=f"some of {names}")
     found = {}
     for name, value in values.items():
         if not _fits(value, hints[name], most_of.get(name, most)):
             kind = hints[name].__name__ if isinstance(hints[name], type) else str(hints[name]).removeprefix("typing.")
-            raise input_error(name, got=repr(value), expected=f"{kind}, at most {most_of.get(name, most)}")
+            raise input_error(f"{what}: {name}", got=repr(value), expected=f"{kind}, at most {most_of.get(name, most)}")
         found[name] = tuple(value) if isinstance(value, list) else value
     return found
 

@@ -85,7 +85,7 @@ class Npz:
         return tuple(self.headers)
 
     def _damaged(self, error: object, name: str | None = None) -> InputError:
-        what = "NPZ file cannot be read" if name is None else f"array `{name}` cannot be read"
+        what = "not a readable NPZ file" if name is None else f"array `{name}` cannot be read"
         got = f"{type(error).__name__}: {error}" if isinstance(error, Exception) and not str(error) else error
         return input_error(what, got=got, do="is it truncated?", file=self.path)
 

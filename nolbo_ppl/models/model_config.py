@@ -184,7 +184,7 @@ class ModelConfig:
         """From `to_json`'s dictionary. Raises `InputError` naming a field that is unknown, of another type or out of range."""
         if not isinstance(values, dict):
             raise input_error("model configuration", got=type(values).__name__, expected="an object")
-        return cls(**check_fields(cls, values, LARGEST, LARGEST_OF))
+        return cls(**check_fields(cls, values, "a model configuration", LARGEST, LARGEST_OF))
 
 
 def tiny() -> ModelConfig:

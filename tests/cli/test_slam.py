@@ -108,7 +108,7 @@ def test_covariances_of_odometry_steps(folder: Path, tmp_path: Path, capsys: pyt
     main(arguments(folder, tmp_path / "out", **{option: str(tmp_path / "good.npz"), "truth": str(folder / "truth.txt")}))
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["after"]["ate"] < summary["before"]["ate"]
-    expected = {"bad": "step 7", "other": "no array `covariance`", "text": "cannot be read", "none": "no such file"}
+    expected = {"bad": "step 7", "other": "no array `covariance`", "text": "not a readable NPZ", "none": "no such file"}
     for name, match in expected.items():
         with pytest.raises(SystemExit):
             main(arguments(folder, tmp_path / "no", **{option: str(tmp_path / f"{name}.npz")}))
@@ -151,5 +151,5 @@ def test_interruption_leaves_no_half_written_file(folder: Path, tmp_path: Path, 
     with pytest.raises(SystemExit) as stop:
         main([*arguments(folder, tmp_path), "--config.em-iterations", "1"])
     assert stop.value.code == 130
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["iterations.npz", "landmarks.json", "trajectory.txt"]
+    assert not list(tmp_path.iterdir()), "a result is complete or absent"
     json.loads((tmp_path / "landmarks.json").read_text())

@@ -279,7 +279,7 @@ def test_covariances_and_every_kind_of_damage(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"odometry_covariance\.npz: .*" + match):
             covariance_beside(tmp_path / "odometry.txt")
     path.write_text("no archive")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="not a readable NPZ file"):
         read_covariance(path)
     with pytest.raises(InputError, match=r"none\.npz: no such file"):
         read_covariance(tmp_path / "none.npz")

@@ -56,7 +56,7 @@ def test_refusals(changes: dict[str, Any], message: str) -> None:
 
 
 def test_unknown_fields_are_named() -> None:
-    with pytest.raises(InputError, match=r"unknown model configuration: got \['latent'\]"):
+    with pytest.raises(InputError, match=r"unknown fields of a model configuration: got \['latent'\]"):
         ModelConfig.from_json({"latent": 3})
 
 
@@ -74,3 +74,35 @@ def test_networks_depend_on_the_seed_only() -> None:
     for (name, x), y in zip(a.state_dict().items(), b.state_dict().values(), strict=True):
         assert torch.equal(x, y), name
     assert not torch.equal(c.guide.head.objectness.weight, a.guide.head.objectness.weight)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("glimpse_blocks", 10**9),
+        ("encoder_blocks", [1, 10**9, 1]),
+        ("encoder_blocks", [1, 1]),
+        ("latent_dim", 16.0),
+        ("latent_dim", True),
+        ("latent_dim", "16"),
+        ("latent_dim", 10**400),
+        ("latent_dim", None),
+        ("head_width", 0),
+        ("max_concentration", float("nan")),
+        ("max_concentration", -1.0),
+        ("box_scale", 1e300),
+        ("box_loc", [0, 0, "0", 0]),
+        ("categories", "chair"),
+        ("categories", [1, 2]),
+        ("encoder", "huge"),
+        ("voxel_size", 48),
+        ("voxel_patches", 1),
+        ("orientation", ["mixture"]),
+    ],
+)
+def test_values_of_other_types_or_sizes_are_refused_by_name(name: str, value: object) -> None:
+    values = {**ModelConfig().to_json(), name: value}
+    with pytest.raises(InputError, match=name):
+        ModelConfig.from_json(values)
+    with pytest.raises(InputError, match="model configuration"):
+        ModelConfig.from_json([values])  # type: ignore[arg-type]

@@ -88,7 +88,7 @@ def test_other_folders_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(InputError, match="something else than a run"):
         Workshop(tmp_path).run()
-    (tmp_path / RECORD).write_text("[]")
+    (tmp_path / RECORD).write_text("{}")
     with pytest.raises(InputError, match="not the record of a run"):
         Workshop(tmp_path).run()
     assert (tmp_path / "thesis.tex").read_text() == "x"

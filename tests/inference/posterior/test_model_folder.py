@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+import nolbo_ppl
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.posterior.model_folder import load, save
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.io.tensors import file_hash, load_tensors, save_tensors
 from nolbo_ppl.models.posterior_calibration import Calibration
 from tests.factories import instance_config, tiny_model
 
@@ -67,9 +69,14 @@ def test_unknown_names_and_damaged_folders(tmp_path: Path) -> None:
     for change, message in (
         ({"model": {**values["model"], "latent_dim": 8}}, r"model.safetensors: weight .*expected shape"),
         ({"model": {**values["model"], "encoder_blocks": [1, 1, 1]}}, r"weights do not fit the model.*missing"),
-        ({"model": {**values["model"], "flavour": 1}}, r"unknown model configuration.*flavour"),
+        ({"model": {**values["model"], "flavour": 1}}, r"unknown fields of a model configuration.*flavour"),
         ({"calibration": {"shape_scale": -1.0}}, "calibration factor shape_scale"),
         ({"calibration": {"slope": 1.0}}, "unknown calibration factors"),
+        ({"calibration": {"shape_scale": "1"}}, r"config.json: calibration factor shape_scale"),
+        ({"calibration": [1]}, r"config.json: calibration: got list"),
+        ({"model": {**values["model"], "glimpse_blocks": 10**9}}, r"config.json: a model configuration: glimpse_blocks"),
+        ({"model": {**values["model"], "head_width": 8000}}, r"model.safetensors: weight"),
+        ({"sha256": "0" * 64}, r"model.safetensors: weights were changed: got \w+, expected SHA-256 000"),
     ):
         config.write_text(json.dumps({**values, **change}))
         with pytest.raises(InputError, match=message):
@@ -80,3 +87,21 @@ def test_unknown_names_and_damaged_folders(tmp_path: Path) -> None:
     config.write_text("{")
     with pytest.raises(InputError, match=r"config.json:1: not valid JSON"):
         load(tmp_path)
+
+
+def test_weights_that_were_exchanged_are_noticed(tmp_path: Path) -> None:
+    """Other weights of the same form pass every check but the hash."""
+    saved(tmp_path)
+    load(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    tensors, meta = load_tensors(weights)
+    name = next(name for name, tensor in tensors.items() if tensor.is_floating_point())
+    tensors[name] = tensors[name] + 1
+    save_tensors(weights, tensors, meta)
+    with pytest.raises(InputError, match="weights were changed"):
+        load(tmp_path)
+
+
+def test_shipped_weights_state_their_hash() -> None:
+    for file in (Path(nolbo_ppl.__file__).parent / "weights").glob("*/config.json"):
+        assert json.loads(file.read_text())["sha256"] == file_hash(file.with_name("model.safetensors")), file
