@@ -152,4 +152,3 @@ def test_interruption_leaves_no_half_written_file(folder: Path, tmp_path: Path, 
         main([*arguments(folder, tmp_path), "--config.em-iterations", "1"])
     assert stop.value.code == 130
     assert not list(tmp_path.iterdir()), "a result is complete or absent"
-    json.loads((tmp_path / "landmarks.json").read_text())

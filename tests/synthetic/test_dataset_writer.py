@@ -219,7 +219,7 @@ def test_malformed_folders(user: Callable[..., Path], tmp_path: Path) -> None:
     opened = SceneFolder(folder, size=64)
     data = (folder / "a.png").read_bytes()
     (folder / "a.png").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match=r"a.png: not a readable picture"):
+    with pytest.raises(InputError, match=r"a.png: not a readable image"):
         opened.batch([0])
     (folder / "scenes.jsonl").write_text("\n\n")
     with pytest.raises(InputError, match="a data set without images"):
