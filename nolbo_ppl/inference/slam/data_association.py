@@ -1,28 +1,31 @@
-"""The E-step of single detections against a map: exact marginals of every frame, with new-landmark and background odds."""
+"""The E-step of single detections against a map: exact marginals of every frame under the generative model of a frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
-from nolbo_ppl.geometry.pose import inverse, transform
-from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.geometry.pose import transform
+from nolbo_ppl.inference.slam.detection_pairs import detection_pairs
+from nolbo_ppl.inference.slam.existence import contribution, detected_log_odds, existence_log_odds, score_correlation
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
-from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
-from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
-from nolbo_ppl.inference.slam.measurements import Measurements
-from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
-from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
+from nolbo_ppl.inference.slam.frame_model import (
+    PROBABILITY_LIMITS,
+    FrameModel,
+    estimate_frame_model,
+    exposures_of,
+    initial_frame_model,
+)
+from nolbo_ppl.inference.slam.graph import Linearisation
+from nolbo_ppl.inference.slam.slam_state import SlamState
 
-GATE = 25.0
-"""Squared Mahalanobis distance beyond which a detection is no candidate for a landmark."""
-MAP_ROTATION = 0.02
-"""Standard deviation of each angle that the map's own orientation adds, rad."""
 LISTED = 1e-4
 """Marginals below this are not listed."""
+ROUNDS = 5
+"""E-steps, and M-steps of the model of a frame, of one association."""
 
 
 @dataclass(frozen=True)
@@ -43,107 +46,78 @@ class Associations:
     """Log evidence of each frame with detections, nats."""
     exact: bool
     """Whether every frame was summed exactly."""
+    existence: Float[np.ndarray, " m"]
+    """Probability of each landmark being an object."""
+    model: FrameModel
+    """The model of a frame, as estimated."""
 
 
-def associate_detections(
-    measurements: Measurements,
-    noise: NoiseModel,
-    config: SlamConfig,
-    prior: FeaturePrior,
-    estimate: SlamEstimate,
-    features: TrackletFeatures,
-    linearisation: Linearisation,
-    rng: np.random.Generator,
-) -> Associations:
-    """Marginals of all detections over the landmarks of a map.
+def associate_detections(state: SlamState, linearisation: Linearisation, rng: np.random.Generator) -> Associations:
+    """Marginals of all detections over the landmarks of a map, and the model of a frame they are computed with.
 
-    Detection k of frame t is landmark j with odds `p(score | object) N(x_k; x(T_t, l_j), S + relative covariance) ...`, a new
-    object with `p(score | object) lambda_new`, background with `p(score | clutter) lambda_clutter` (docs/em.md).
+    Every landmark is a Bernoulli component: in each frame it is missed with probability `1 - r P_D`, or causes one
+    detection. Odds of detection k of frame t (docs/em.md), over those of clutter:
+
+    - landmark j: `s_k p(z_k | l_j) r_j P_D / (1 - r_j P_D)`, position, latent, orientation and existence without k itself;
+    - an object the map does not hold: `s_k (density of objects) P(missed wherever else it was in view)`;
+    - background: the density of clutter at that range.
+
+    E-step and M-step of the model of the frame alternate `ROUNDS` times.
+
+    Args:
+        state: the map; its rows, landmarks and weights say which detection placed which landmark.
+        linearisation: of its graph.
+        rng: draws the posterior samples of relative positions.
     """
-    log_new = measurements.log_object + np.log(noise.new_rate)
-    log_clutter = measurements.log_clutter + np.log(noise.clutter_rate)
-    log_null = np.logaddexp(log_new, log_clutter)
-    pose_delta, landmark_delta = linearisation.samples(min(config.samples, 48), rng)
-    rows, landmarks, square, log_det = _gated(measurements, estimate, pose_delta, landmark_delta)
-    value = measurements.log_object[rows] - 0.5 * (square + log_det)
-    value += feature_log_ratio(measurements, rows, landmarks, prior, config, estimate, features)
-    found = frame_marginals(measurements.frame, rows, landmarks, value, log_null, associator=config.associator)
-    listed = found.weight > LISTED
-    new = found.null * np.exp(log_new - log_null)
+    seen, config = state.measurements, state.config
+    n, m = len(seen), len(state.estimate.T_world_landmark)
+    pairs = detection_pairs(state, linearisation, rng)
+    model = state.frame_model or initial_frame_model(seen, config, len(state.problem))
+    T_world_camera = state.estimate.T_world_camera
+    world = transform(T_world_camera[seen.frame], seen.position)
+    of_landmark = exposures_of(model, T_world_camera, state.estimate.T_world_landmark[:, :3, 3])
+    of_detection = exposures_of(model, T_world_camera, world)
+    moving = moving_detections(state)
+    log_odds, weight = np.full(m, 50.0), np.zeros(len(pairs))  # every landmark exists until the first E-step
+    hit_cell = model.cell(pairs.local)
+    for _ in range(ROUNDS):
+        score = model.log_score_ratio(seen)
+        log_clutter = model.log_clutter(seen)
+        count, chance = of_detection.totals(model, n)
+        chance = np.clip(chance, *PROBABILITY_LIMITS)
+        log_once = model.log_pattern(np.ones(n), np.maximum(count, 1.0), chance) - np.log(chance)
+        log_once[moving] = 0.0  # it was elsewhere
+        log_new = score + log_once + np.log(model.unmapped)
+        log_new += np.log(model.new_rate) if model.new_rate is not None else model.log_objects(seen)
+        log_null = np.logaddexp(log_new, log_clutter)
+        log_odds_without = log_odds[pairs.landmark] - contribution(state, pairs, weight, model, of_landmark)
+        log_detected = detected_log_odds(state, pairs, weight, model, of_landmark, log_odds_without)
+        value = score[pairs.row] + pairs.log_position + pairs.log_feature + log_detected
+        found = frame_marginals(seen.frame, pairs.row, pairs.landmark, value, log_null, associator=config.associator)
+        weight = found.weight
+        new = found.null * np.exp(log_new - log_null)
+        background = np.maximum(found.null - new, 0.0)
+        hits = np.bincount(pairs.landmark, weight, minlength=m)
+        model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
+        log_odds = existence_log_odds(state, pairs, weight, model, of_landmark)
+        model = estimate_frame_model(
+            model, seen, background, new, np.exp(log_once), of_landmark, hit_cell, weight, expit(log_odds), hits
+        )
+    listed = weight > LISTED
     return Associations(
-        row=rows[listed],
-        landmark=landmarks[listed],
-        weight=found.weight[listed],
+        row=pairs.row[listed],
+        landmark=pairs.landmark[listed],
+        weight=weight[listed],
         new=new,
-        background=np.maximum(found.null - new, 0.0),
+        background=background,
         log_evidence=found.log_evidence,
         exact=found.exact,
+        existence=expit(log_odds),
+        model=model,
     )
 
 
-def feature_log_ratio(
-    measurements: Measurements,
-    rows: Int[np.ndarray, " p"],
-    landmarks: Int[np.ndarray, " p"],
-    prior: FeaturePrior,
-    config: SlamConfig,
-    estimate: SlamEstimate,
-    features: TrackletFeatures,
-) -> Float[np.ndarray, " p"]:
-    """Log ratio of the latent, category and orientation of detections given landmarks to those of any object, nats.
-
-    A pair without an orientation on both sides has no orientation term: the ratio is that to the uniform density.
-    """
-    seen = measurements
-    value = prior.pair_log_ratio(
-        seen.latent[rows],
-        seen.latent_variance[rows],
-        seen.category[rows],
-        features.latent[landmarks],
-        features.latent_variance[landmarks],
-        features.category[landmarks],
-    )
-    both = np.flatnonzero(seen.oriented[rows] & features.oriented[landmarks])
-    if len(both):
-        k, j = rows[both], landmarks[both]
-        predicted = np.swapaxes(estimate.T_world_camera[seen.frame[k], :3, :3], 1, 2) @ estimate.T_world_landmark[j, :3, :3]
-        modes = seen.modes.select(k)
-        modes = OrientationModes(modes.log_weight, modes.R, np.hypot(modes.scale, MAP_ROTATION))
-        value[both] += mixture_log_density(predicted, modes, seen.symmetry[k], config) - UNIFORM_LOG_DENSITY
-    return value
-
-
-def _gated(
-    measurements: Measurements, estimate: SlamEstimate, pose_delta: np.ndarray, landmark_delta: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Detection-landmark pairs inside the gate: rows, landmarks, squared distances and log determinants of 2 pi S."""
-    seen, T_world_camera = measurements, estimate.T_world_camera
-    position = estimate.T_world_landmark[:, :3, 3]
-    world = transform(T_world_camera[seen.frame], seen.position)
-    count = pose_delta.shape[2]
-    R_landmark, R_camera = estimate.T_world_landmark[:, :3, :3], T_world_camera[:, :3, :3]
-    moved_landmark = np.einsum("mij,mjs->mis", R_landmark, landmark_delta[:, 3:])
-    scale = np.sqrt(np.trace(seen.covariance, axis1=1, axis2=2))
-    # A generous first gate on the sensor's scale plus a fifth of the range for the relative pose.
-    reach = 5 * scale + 0.2 * np.linalg.norm(seen.position, axis=1)
-    out: list[tuple[np.ndarray, ...]] = []
-    for start in range(0, len(seen), 2000):
-        part = np.arange(start, min(start + 2000, len(seen)))
-        distance = np.linalg.norm(world[part, None] - position[None], axis=2)
-        i, j = np.nonzero(distance < reach[part, None])
-        k = part[i]
-        frame = seen.frame[k]
-        local = transform(inverse(T_world_camera[frame]), position[j])
-        error = local - seen.position[k]
-        # Deviation of the landmark in the camera's frame: R'(dp - R v) - omega x local.
-        deviation = np.einsum("pji,pjs->pis", R_camera[frame], moved_landmark[j]) - pose_delta[frame, 3:]
-        deviation -= np.cross(pose_delta[frame, :3], local[:, :, None], axis=1)
-        S = seen.covariance[k] + deviation @ np.swapaxes(deviation, 1, 2) / count
-        squared, log_determinant = squared_distance(error, S)
-        inside = squared < GATE
-        out.append((k[inside], j[inside], squared[inside], log_determinant[inside]))
-    if not out:
-        empty = np.zeros(0, dtype=np.int64)
-        return empty, empty, np.zeros(0), np.zeros(0)
-    rows, landmarks, square, log_det = (np.concatenate(x) for x in zip(*out))
-    return rows, landmarks, square, log_det
+def moving_detections(state: SlamState) -> Bool[np.ndarray, " n"]:
+    """Detections of tracks that move."""
+    track = state.tracklets.of_observation
+    return (track >= 0) & state.tracklets.moving[np.maximum(track, 0)] if len(state.tracklets) else np.zeros(len(track), bool)

@@ -1,4 +1,5 @@
-"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, every detection associated anew."""
+"""From soft links to a map: tracklets merged by evidence, a clean solve without kernels, and EM of
+every detection with the map: exact marginals under the model of a frame, then a solve with them as weights."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
-from nolbo_ppl.inference.slam.data_association import Associations, associate_detections
+from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections
 from nolbo_ppl.inference.slam.em import make_links
 from nolbo_ppl.inference.slam.graph import Links, SlamEstimate, linearise, optimise
 from nolbo_ppl.inference.slam.initialise import (
@@ -28,6 +29,8 @@ MERGE_LOG_ODDS = 3.0
 """Two landmarks are merged in the end when one explains them better by this many nats."""
 BROKEN_LINK = 6.0
 """A link stretched to this many of its scales by the others is cut."""
+SMALLEST_MARGINAL = 0.01
+"""Associations of lower probability are left out of the map's M-step."""
 
 
 def surviving_links(state: SlamState) -> Links:
@@ -87,28 +90,23 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
 
 
 def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, Associations]:
-    """E-step of every detection against the map; detections join or leave landmarks by it, empty landmarks go."""
-    graph = base_graph(state)
-    found = associate_detections(
-        state.measurements,
-        state.noise,
-        state.config,
-        state.prior,
-        state.estimate,
-        state.features,
-        linearise(graph, state.estimate),
-        rng,
+    """E-step of every detection against the map: each enters the graph with its marginals, one factor a landmark.
+
+    Detections of moving tracks stay out.
+    """
+    found = associate_detections(state, linearise(base_graph(state), state.estimate), rng)
+    use = (found.weight > SMALLEST_MARGINAL) & ~moving_detections(state)[found.row]
+    rows, landmark, weight = found.row[use], found.landmark[use], found.weight[use]
+    features = tracklet_features(
+        state.measurements, state.config, state.prior, rows, landmark, weight, len(state.estimate.T_world_landmark)
     )
-    best = np.full(len(state.problem.observations), -1)
-    weight = np.zeros(len(best))
-    order = np.argsort(found.weight, kind="stable")
-    best[found.row[order]], weight[found.row[order]] = found.landmark[order], found.weight[order]
-    rows = np.flatnonzero(weight > 0.5)
-    moving = np.zeros(len(best), dtype=bool)
-    tracks = state.tracklets.of_observation
-    moving[tracks >= 0] = state.tracklets.moving[tracks[tracks >= 0]]
-    rows = rows[~moving[rows]]
-    return replace(state, rows=rows, landmark=best[rows], weight=weight[rows]), found
+    return replace(state, rows=rows, landmark=landmark, weight=weight, features=features, frame_model=found.model), found
+
+
+def solve_soft(state: SlamState, tolerance: float = 1e-8) -> SlamState:
+    """The M-step of the map: solve with the marginals as frozen weights."""
+    estimate, _, error = optimise(base_graph(state), state.estimate, iterations=30, relative_tolerance=tolerance)
+    return replace(state, estimate=estimate, graph_error=error)
 
 
 def drop_empty(state: SlamState, minimum: float) -> SlamState:
@@ -142,20 +140,19 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     state = merge_duplicates(solve_clean(state, repeats=2, tolerance=1e-5), rng)
     state = solve_clean(state)
     state, _ = reassociate(state, rng)
-    state = drop_empty(state, 0.5)
-    state = solve_clean(state, repeats=2)
+    state = solve_soft(drop_empty(state, 0.5))
     if len(state.rows):
         state = refine_odometry(state, linearise_state(state))
         state, (rotation, translation) = settle_odometry(state)
-        state = solve_clean(state, repeats=1)
+        state = solve_soft(state)
         if min(rotation, translation) < 1:
             noise = state.noise
             stiff = replace(
                 noise, rotation_step=noise.rotation_step * rotation, translation_step=noise.translation_step * translation
             )
-            state = replace(state, estimate=solve_clean(replace(state, noise=stiff), repeats=1).estimate)
-    _, found = reassociate(state, rng)
-    return state, found
+            state = replace(state, estimate=solve_soft(replace(state, noise=stiff)).estimate)
+    final, found = reassociate(state, rng)
+    return replace(final, rows=state.rows, landmark=state.landmark, weight=state.weight, features=state.features), found
 
 
 def final_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:

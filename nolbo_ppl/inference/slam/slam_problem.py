@@ -83,6 +83,9 @@ class SlamConfig:
     """Density of landmarks not seen before, per m^3 of the observed space."""
     clutter_rate: float | None = None
     """Density of false detections, per m^3 of the observed space and frame."""
+    field_of_view: tuple[float, float] | None = None
+    """Full horizontal and vertical angle of the camera's view, rad (`2 arctan(width / 2 fx)`). None: learnt from where detections
+    lie. Objects in view that are not detected speak against their existence."""
     objectness_limits: tuple[float, float] = (0.02, 0.98)
     """Objectness is clipped to this, so that background always remains possible."""
     objectness_prior: float | None = None
@@ -147,6 +150,8 @@ class SlamConfig:
             _check_number("annealing", factor, 1e-3, 1e6, False)
         if self.objectness_prior is not None and not 0 < self.objectness_prior < 1:
             raise input_error("objectness_prior", got=self.objectness_prior, expected="a share between 0 and 1")
+        if self.field_of_view is not None and not all(0 < angle <= 2 * np.pi for angle in self.field_of_view):
+            raise input_error("field_of_view", got=self.field_of_view, expected="two angles above 0 and at most 2 pi")
 
 
 def check_step_covariance(covariance: np.ndarray, steps: int) -> None:

@@ -10,11 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, category_index
 from nolbo_ppl.inference.slam.em import EmStepInfo
-from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise, to_values
 from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, mixture_covariances
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, Voxels, decode_landmarks
@@ -129,29 +127,8 @@ class SlamResult:
         return [summed[j] / total[j] if total[j] > 0 else None for j in range(len(total))]
 
     def existence(self) -> Float[np.ndarray, " m"]:
-        """Probability that each landmark is an object rather than background seen again and again.
-
-        Log odds: `log lambda_new + sum_k w_k [log q(o_k) + log N(x_k; l)] + log |2 pi Sigma_l|^1/2` (the landmark's
-        position integrated out) less `sum_k w_k [log(1 - q(o_k)) + log lambda_clutter]`.
-        """
-        state = self.state
-        table, rows = state.problem.observations, state.rows
-        m = len(state.static)
-        frame = table.frame[rows]
-        predicted = transform(
-            inverse(state.estimate.T_world_camera[frame]), state.estimate.T_world_landmark[state.landmark, :3, 3]
-        )
-        error = predicted - table.position[rows]
-        S = state.noise.position_covariance[rows]
-        objectness = np.clip(table.objectness[rows], *state.config.objectness_limits)
-        log_ratio = np.log(objectness) - np.log1p(-objectness) - np.log(state.noise.clutter_rate) + log_normal(error, S)
-        log_odds = np.full(m, np.log(state.noise.new_rate))
-        np.add.at(log_odds, state.landmark, state.weight * log_ratio)
-        information = np.tile(1e-12 * np.eye(3), (m, 1, 1))
-        R = state.estimate.T_world_camera[frame, :3, :3]
-        np.add.at(information, state.landmark, state.weight[:, None, None] * (R @ np.linalg.inv(S) @ np.swapaxes(R, 1, 2)))
-        log_odds += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
-        return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700)))
+        """Probability that each landmark is an object rather than background seen again and again (docs/em.md)."""
+        return self.associations.existence
 
     def class_posterior(self) -> Float[np.ndarray, "m c"]:
         """Posterior over categories of each landmark from all its detections; no columns where none was reported."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.frame_model import FrameModel
 from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
@@ -54,6 +55,9 @@ class SlamState:
     """Half the sum of squared whitened residuals of the last M-step."""
     closed: dict[int, int] = field(default_factory=dict)
     """Tracklets closed by constellation, newer to older."""
+
+    frame_model: FrameModel | None = None
+    """Model of a frame's detections, once the map has been associated."""
 
     @cached_property
     def measurements(self) -> Measurements:

@@ -1,0 +1,107 @@
+"""Whether a landmark exists: the ratio of marginal likelihoods of an object there and of clutter, missed detections counted."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from nolbo_ppl.inference.slam.detection_pairs import DetectionPairs
+from nolbo_ppl.inference.slam.frame_model import PROBABILITY_LIMITS, Exposures, FrameModel
+from nolbo_ppl.inference.slam.measurements import Measurements
+from nolbo_ppl.inference.slam.slam_state import SlamState
+
+LEAST_LANDMARKS = 10
+"""Landmarks of three scores or more that a correlation of scores is measured on."""
+
+
+def score_correlation(measurements: Measurements, pairs: DetectionPairs, weight: Float[np.ndarray, " p"]) -> float:
+    """Intraclass correlation of the scores' log odds within landmarks (one-way analysis of variance), from 0 to 0.95."""
+    use = weight > 0.5
+    score = (measurements.log_object - measurements.log_clutter)[pairs.row[use]]
+    group = np.unique(pairs.landmark[use], return_inverse=True)[1]
+    count = np.bincount(group)
+    keep = count[group] >= 3
+    if len(np.unique(group[keep])) < LEAST_LANDMARKS:
+        return 0.0
+    score, group = score[keep], np.unique(group[keep], return_inverse=True)[1]
+    count = np.bincount(group).astype(np.float64)
+    mean = np.bincount(group, score) / count
+    within = np.sum((score - mean[group]) ** 2) / max(len(score) - len(count), 1)
+    between = np.sum(count * (mean - score.mean()) ** 2) / max(len(count) - 1, 1)
+    typical = (count.sum() - np.sum(count**2) / count.sum()) / max(len(count) - 1, 1)
+    return float(np.clip((between - within) / max(between + (typical - 1) * within, 1e-12), 0.0, 0.95))
+
+
+def mean_score(model: FrameModel, hits: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Weight of each view's score evidence: n correlated looks are worth `n / (1 + r (n - 1))` independent ones."""
+    return 1.0 / (1.0 + model.score_correlation * np.maximum(hits - 1.0, 0.0))
+
+
+def existence_log_odds(
+    state: SlamState, pairs: DetectionPairs, weight: Float[np.ndarray, " p"], model: FrameModel, exposures: Exposures
+) -> Float[np.ndarray, " m"]:
+    """Log odds of each landmark being an object rather than so many false detections.
+
+    `log rho + log integral of prod N(x_k; l) dl + sum s_k + log P(hits and misses) - sum log lambda_clutter(x_k)`, with the
+    density rho of objects, score ratios s_k, and the beta-binomial probability of being detected in just these of all frames
+    that had it in view. Soft weights enter as exponents, with their entropy (the variational bound of each frame's sum).
+    """
+    seen, m = state.measurements, len(state.estimate.T_world_landmark)
+    k, j = pairs.row, pairs.landmark
+    hits = np.bincount(j, weight, minlength=m)
+    probability = np.clip(model.probability(pairs.local), *PROBABILITY_LIMITS)
+    log_clutter = model.log_clutter(seen)[k]
+    score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
+    safe = np.clip(weight, 1e-12, 1 - 1e-12)
+    entropy = -safe * np.log(safe) - (1 - safe) * np.log1p(-safe)
+    value = np.bincount(j, weight * (pairs.log_residual + score - log_clutter) + entropy, minlength=m)
+    log_density = model.log_objects(seen)[k] - np.log(probability)
+    value += np.bincount(j, weight * log_density, minlength=m) / np.maximum(hits, 1e-9)
+    information = np.tile(1e-9 * np.eye(3), (m, 1, 1))
+    R = state.estimate.T_world_camera[seen.frame[k], :3, :3]
+    np.add.at(information, j, weight[:, None, None] * (R @ np.linalg.inv(seen.covariance[k]) @ np.swapaxes(R, 1, 2)))
+    value += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
+    number, mean = exposures.totals(model, m)
+    value += model.log_pattern(hits, np.maximum(number, hits), mean)
+    return np.where(hits > 1e-6, value, -50.0)
+
+
+def contribution(
+    state: SlamState,
+    pairs: DetectionPairs,
+    weight: Float[np.ndarray, " p"],
+    model: FrameModel,
+    exposures: Exposures,
+) -> Float[np.ndarray, " p"]:
+    """What each pair adds to its landmark's log odds of existing: taken off, the landmark is judged without the detection."""
+    seen, m = state.measurements, len(state.estimate.T_world_landmark)
+    k, j = pairs.row, pairs.landmark
+    hits = np.bincount(j, weight, minlength=m)
+    number, mean = exposures.totals(model, m)
+    number = np.maximum(number, hits)
+    without = np.maximum(hits[j] - weight, 0.0)
+    pattern = model.log_pattern(hits, number, mean)[j] - model.log_pattern(without, number[j], mean[j])
+    score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
+    return weight * (pairs.log_position + score - model.log_clutter(seen)[k]) + pattern
+
+
+def detected_log_odds(
+    state: SlamState,
+    pairs: DetectionPairs,
+    weight: Float[np.ndarray, " p"],
+    model: FrameModel,
+    exposures: Exposures,
+    log_odds_without: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """`log r P_D / (1 - r P_D)` of each pair: existence r and detection probability as the other frames show them."""
+    m = len(state.estimate.T_world_landmark)
+    hits = np.bincount(pairs.landmark, weight, minlength=m)
+    number, _ = exposures.totals(model, m)
+    here = np.clip(model.probability(pairs.local), *PROBABILITY_LIMITS)
+    others = np.maximum(hits[pairs.landmark] - weight, 0.0)
+    total = np.maximum(np.maximum(number, hits)[pairs.landmark] - 1.0, others)
+    probability = (model.concentration * here + others) / (model.concentration + total)
+    probability = np.clip(probability, *PROBABILITY_LIMITS)
+    existence = 1.0 / (1.0 + np.exp(-np.clip(log_odds_without, -500, 500)))
+    detected = np.maximum(existence * probability, 1e-300)
+    return np.log(detected) - np.log1p(-detected)
