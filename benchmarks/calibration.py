@@ -242,9 +242,8 @@ def table(name: str, rows: list[dict[str, Any]]) -> None:
         print(f"  {which}, largest gap {gap:.3f}: " + " ".join(f"{p:.2f}>{y:.2f}({n})" for p, y, n in bins))
     middle = pooled(rows, "existence")
     middle = middle[(middle[:, 0] > 0.1) & (middle[:, 0] < 0.9)]
-    print(
-        f"  existence stated 0.1 to 0.9   {len(middle)}, mean {middle[:, 0].mean() if len(middle) else np.nan:.2f}, real {int(middle[:, 1].sum())}"
-    )
+    stated, real = (middle[:, 0].mean(), middle[:, 1].mean()) if len(middle) else (np.nan, np.nan)
+    print(f"  existence stated 0.1 to 0.9   {len(middle)} landmarks, mean {stated:.2f}, real {real:.2f}")
     for which in ("existence", "class", "association_few"):
         print(f"  {which}, stated / right".ljust(32) + f"{interval(rows, share(which, 0))} / {interval(rows, share(which, 1))}")
     for figure in ("landmarks", "nees_pose", "nees_position", "nees_orientation", "nees_latent"):

@@ -101,7 +101,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
         log_odds = existence_log_odds(state, pairs, weight, model, of_landmark)
         model = estimate_frame_model(
-            model, seen, background, new, np.exp(log_once), of_landmark, hit_cell, weight, expit(log_odds), hits
+            model, seen, background, new, np.exp(log_once), of_landmark, of_detection, hit_cell, weight, expit(log_odds), hits
         )
     listed = weight > LISTED
     return Associations(

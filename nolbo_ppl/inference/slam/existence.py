@@ -10,6 +10,8 @@ from nolbo_ppl.inference.slam.frame_model import PROBABILITY_LIMITS, Exposures, 
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
+NO_EVIDENCE = -50.0
+"""Log odds of a landmark that no detection speaks for."""
 LEAST_LANDMARKS = 10
 """Landmarks of three scores or more that a correlation of scores is measured on."""
 
@@ -44,7 +46,8 @@ def existence_log_odds(
 
     `log rho + log integral of prod N(x_k; l) dl + sum s_k + log P(hits and misses) - sum log lambda_clutter(x_k)`, with the
     density rho of objects, score ratios s_k, and the beta-binomial probability of being detected in just these of all frames
-    that had it in view. Soft weights enter as exponents, with their entropy (the variational bound of each frame's sum).
+    that had it in view. Features of false detections are independent draws of the population, those of an object alike.
+    Soft weights enter as exponents, with their entropy (the variational bound of each frame's sum).
     """
     seen, m = state.measurements, len(state.estimate.T_world_landmark)
     k, j = pairs.row, pairs.landmark
@@ -55,15 +58,19 @@ def existence_log_odds(
     safe = np.clip(weight, 1e-12, 1 - 1e-12)
     entropy = -safe * np.log(safe) - (1 - safe) * np.log1p(-safe)
     value = np.bincount(j, weight * (pairs.log_residual + score - log_clutter) + entropy, minlength=m)
+    # Each ratio is that of one detection given all others; of n in a row, the first has none before it.
+    value += np.bincount(j, weight * pairs.log_feature, minlength=m) * np.maximum(hits - 1, 0) / np.maximum(hits, 1)
     log_density = model.log_objects(seen)[k] - np.log(probability)
     value += np.bincount(j, weight * log_density, minlength=m) / np.maximum(hits, 1e-9)
     information = np.tile(1e-9 * np.eye(3), (m, 1, 1))
     R = state.estimate.T_world_camera[seen.frame[k], :3, :3]
-    np.add.at(information, j, weight[:, None, None] * (R @ np.linalg.inv(seen.covariance[k]) @ np.swapaxes(R, 1, 2)))
+    # What hardly any detection speaks for is as large as one detection: else its volume, and its odds, would be without bound.
+    whole = weight / np.clip(hits, 1e-12, 1.0)[j]
+    np.add.at(information, j, whole[:, None, None] * (R @ np.linalg.inv(seen.covariance[k]) @ np.swapaxes(R, 1, 2)))
     value += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
     number, mean = exposures.totals(model, m)
     value += model.log_pattern(hits, np.maximum(number, hits), mean)
-    return np.where(hits > 1e-6, value, -50.0)
+    return np.where(hits > 1e-6, value, NO_EVIDENCE)
 
 
 def contribution(
@@ -82,7 +89,7 @@ def contribution(
     without = np.maximum(hits[j] - weight, 0.0)
     pattern = model.log_pattern(hits, number, mean)[j] - model.log_pattern(without, number[j], mean[j])
     score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
-    return weight * (pairs.log_position + score - model.log_clutter(seen)[k]) + pattern
+    return weight * (pairs.log_position + pairs.log_feature + score - model.log_clutter(seen)[k]) + pattern
 
 
 def detected_log_odds(

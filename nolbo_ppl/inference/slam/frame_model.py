@@ -211,6 +211,7 @@ def estimate_frame_model(
     new: Float[np.ndarray, " n"],
     expected_new: Float[np.ndarray, " n"],
     exposures: Exposures,
+    detection_exposures: Exposures,
     hit_cell: Int[np.ndarray, " p"],
     hit_weight: Float[np.ndarray, " p"],
     existence: Float[np.ndarray, " m"],
@@ -225,14 +226,21 @@ def estimate_frame_model(
         new: probability of each being an object the map does not hold.
         expected_new: probability that an object detected there is detected only there.
         exposures: of the map's landmarks.
+        detection_exposures: of the places of all detections: what the map does not hold was in view as well.
         hit_cell: cell of the view of each pair of detection and landmark, -1 outside.
         hit_weight: its marginal.
         existence: of each landmark.
         hits: summed marginals of each landmark.
     """
     cells = model.detection_probability.size
-    seen = np.bincount(exposures.cell, existence[exposures.point], minlength=cells)
+    # Objects that were never detected were in view too: for each of the others, P(never) / P(once or more) of them.
+    number, chance = exposures.totals(model, len(hits))
+    seen = np.bincount(exposures.cell, (existence * _with_unseen(model, number, chance))[exposures.point], minlength=cells)
+    once = new * _with_unseen(model, *detection_exposures.totals(model, len(new)))
+    seen += np.bincount(detection_exposures.cell, once[detection_exposures.point], minlength=cells)
     hit = np.bincount(hit_cell[hit_cell >= 0], hit_weight[hit_cell >= 0], minlength=cells)
+    own_cell = model.cell(measurements.position)
+    hit += np.bincount(own_cell[own_cell >= 0], new[own_cell >= 0], minlength=cells)
     mean = (hit.sum() + 1.4) / (seen.sum() + 2.0)
     by_range = hit.reshape(RANGES, -1).sum(1) + PRIOR_COUNT * mean, seen.reshape(RANGES, -1).sum(1) + PRIOR_COUNT
     prior = np.repeat(by_range[0] / by_range[1], AZIMUTHS)
@@ -252,6 +260,12 @@ def estimate_frame_model(
     )
     number, chance = exposures.totals(model, len(hits))
     return replace(model, concentration=_fit_concentration(model, hits, np.maximum(number, hits), chance, existence))
+
+
+def _with_unseen(model: FrameModel, number: np.ndarray, chance: np.ndarray) -> np.ndarray:
+    """One over the probability of being detected at all, at most 3."""
+    never = np.exp(model.log_pattern(np.zeros(len(number)), number, chance))
+    return 1.0 / np.maximum(1.0 - never, 1.0 / 3.0)
 
 
 def _fit_concentration(

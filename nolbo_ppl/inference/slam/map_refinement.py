@@ -1,5 +1,5 @@
 """From soft links to a map: tracklets merged by evidence, a clean solve without kernels, and EM of
-every detection with the map: exact marginals under the model of a frame, then a solve with them as weights."""
+every detection with the map: exact marginals under the model of a frame, then a solve with these as weights."""
 
 from __future__ import annotations
 
@@ -152,6 +152,11 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
             )
             state = replace(state, estimate=solve_soft(replace(state, noise=stiff)).estimate)
     final, found = reassociate(state, rng)
+    for _ in range(3):  # landmarks that lost what placed them are no part of the answer
+        if not len(found.existence) or np.bincount(found.landmark, found.weight, minlength=len(found.existence)).min() >= 0.5:
+            break
+        state = solve_soft(drop_empty(final, 0.5))
+        final, found = reassociate(state, rng)
     return replace(final, rows=state.rows, landmark=state.landmark, weight=state.weight, features=state.features), found
 
 

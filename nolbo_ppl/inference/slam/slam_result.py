@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.slam.class_posterior import ConfusionModel, class_posterior, count_votes, fit_confusion
 from nolbo_ppl.inference.slam.data_association import Associations
-from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, category_index
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE
 from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise, to_values
 from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, mixture_covariances
@@ -130,19 +131,28 @@ class SlamResult:
         """Probability that each landmark is an object rather than background seen again and again (docs/em.md)."""
         return self.associations.existence
 
+    @cached_property
+    def confusion(self) -> ConfusionModel:
+        """How categories are confused, and how alike the mistakes of one object's views are, as measured on the map."""
+        return fit_confusion(self._votes, self.state.prior.log_frequency, self.state.config.category_error)
+
+    @cached_property
+    def _votes(self) -> Float[np.ndarray, "m c"]:
+        """Categories reported of each landmark, by association weight."""
+        state, found, categories = self.state, self.associations, self.state.prior.categories
+        table = state.problem.observations
+        stated = None
+        if table.class_names:
+            stated = np.zeros((len(table), len(categories)))
+            for column, name in enumerate(table.class_names):
+                if name in categories:
+                    stated[:, categories.index(name)] = np.nan_to_num(table.class_posterior[:, column])
+            stated = stated[found.row]
+        category = state.measurements.category[found.row]
+        return count_votes(category, stated, found.landmark, found.weight, len(state.static), len(categories))
+
     def class_posterior(self) -> Float[np.ndarray, "m c"]:
         """Posterior over categories of each landmark from all its detections; no columns where none was reported."""
-        state = self.state
-        count = len(state.prior.categories)
-        log_posterior = np.tile(state.prior.log_frequency, (len(state.static), 1)).reshape(len(state.static), count)
-        if not count:
-            return log_posterior
-        category = category_index(state.problem.observations, state.prior)[state.rows]
-        error = state.config.category_error
-        for j, c, w in zip(state.landmark, category, state.weight):
-            if c >= 0:
-                log_likelihood = np.full(count, np.log(error / max(count - 1, 1)))
-                log_likelihood[c] = np.log1p(-error)
-                log_posterior[j] += w * log_likelihood
-        log_posterior -= np.logaddexp.reduce(log_posterior, axis=1, keepdims=True)
-        return np.exp(log_posterior)
+        if not self.state.prior.categories:
+            return np.zeros((len(self.state.static), 0))
+        return class_posterior(self._votes, self.state.prior.log_frequency, self.confusion)
