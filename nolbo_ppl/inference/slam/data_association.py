@@ -97,7 +97,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         weight = found.weight
         new = found.null * np.exp(log_new - log_null)
         background = np.maximum(found.null - new, 0.0)
-        hits = np.bincount(pairs.landmark, weight, minlength=m)
+        hits = np.bincount(pairs.landmark, weight, minlength=m).astype(np.float64)
         model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
         log_odds = existence_log_odds(state, pairs, weight, model, of_landmark)
         model = estimate_frame_model(

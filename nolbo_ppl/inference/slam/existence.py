@@ -51,13 +51,13 @@ def existence_log_odds(
     """
     seen, m = state.measurements, len(state.estimate.T_world_landmark)
     k, j = pairs.row, pairs.landmark
-    hits = np.bincount(j, weight, minlength=m)
+    hits = np.bincount(j, weight, minlength=m).astype(np.float64)
     probability = np.clip(model.probability(pairs.local), *PROBABILITY_LIMITS)
     log_clutter = model.log_clutter(seen)[k]
     score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
     safe = np.clip(weight, 1e-12, 1 - 1e-12)
     entropy = -safe * np.log(safe) - (1 - safe) * np.log1p(-safe)
-    value = np.bincount(j, weight * (pairs.log_residual + score - log_clutter) + entropy, minlength=m)
+    value = np.bincount(j, weight * (pairs.log_residual + score - log_clutter) + entropy, minlength=m).astype(np.float64)
     # Each ratio is that of one detection given all others; of n in a row, the first has none before it.
     value += np.bincount(j, weight * pairs.log_feature, minlength=m) * np.maximum(hits - 1, 0) / np.maximum(hits, 1)
     log_density = model.log_objects(seen)[k] - np.log(probability)
@@ -83,7 +83,7 @@ def contribution(
     """What each pair adds to its landmark's log odds of existing: taken off, the landmark is judged without the detection."""
     seen, m = state.measurements, len(state.estimate.T_world_landmark)
     k, j = pairs.row, pairs.landmark
-    hits = np.bincount(j, weight, minlength=m)
+    hits = np.bincount(j, weight, minlength=m).astype(np.float64)
     number, mean = exposures.totals(model, m)
     number = np.maximum(number, hits)
     without = np.maximum(hits[j] - weight, 0.0)
@@ -102,7 +102,7 @@ def detected_log_odds(
 ) -> Float[np.ndarray, " p"]:
     """`log r P_D / (1 - r P_D)` of each pair: existence r and detection probability as the other frames show them."""
     m = len(state.estimate.T_world_landmark)
-    hits = np.bincount(pairs.landmark, weight, minlength=m)
+    hits = np.bincount(pairs.landmark, weight, minlength=m).astype(np.float64)
     number, _ = exposures.totals(model, m)
     here = np.clip(model.probability(pairs.local), *PROBABILITY_LIMITS)
     others = np.maximum(hits[pairs.landmark] - weight, 0.0)

@@ -235,10 +235,11 @@ def estimate_frame_model(
     cells = model.detection_probability.size
     # Objects that were never detected were in view too: for each of the others, P(never) / P(once or more) of them.
     number, chance = exposures.totals(model, len(hits))
-    seen = np.bincount(exposures.cell, (existence * _with_unseen(model, number, chance))[exposures.point], minlength=cells)
+    mapped = existence * _with_unseen(model, number, chance)
+    seen = np.bincount(exposures.cell, mapped[exposures.point], minlength=cells).astype(np.float64)
     once = new * _with_unseen(model, *detection_exposures.totals(model, len(new)))
     seen += np.bincount(detection_exposures.cell, once[detection_exposures.point], minlength=cells)
-    hit = np.bincount(hit_cell[hit_cell >= 0], hit_weight[hit_cell >= 0], minlength=cells)
+    hit = np.bincount(hit_cell[hit_cell >= 0], hit_weight[hit_cell >= 0], minlength=cells).astype(np.float64)
     own_cell = model.cell(measurements.position)
     hit += np.bincount(own_cell[own_cell >= 0], new[own_cell >= 0], minlength=cells)
     mean = (hit.sum() + 1.4) / (seen.sum() + 2.0)
