@@ -52,7 +52,7 @@ def _log_determinant(linearisation: Linearisation, oriented: Bool[np.ndarray, " 
 
 
 def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
-    """Log density of each detection in the graph at the estimate, over that of being background, nats.
+    """Log density of each detection in the graph at the estimate, over that of being background, by its weight, nats.
 
     Errors that resemble one another from frame to frame count as the graph counts them: their log densities are divided by
     the factor on their covariances.
@@ -69,7 +69,7 @@ def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
         turn = mixture_log_density(T[oriented, :3, :3], modes, symmetry, state.config) - UNIFORM_LOG_DENSITY
         log_density[oriented] += turn / noise.rotation_factor
     log_background = seen.log_clutter + np.log(noise.clutter_rate)
-    return np.logaddexp(seen.log_object + log_density, log_background) - log_background
+    return state.weight * (np.logaddexp(seen.log_object + log_density, log_background) - log_background)
 
 
 def feature_log_evidence(state: SlamState) -> float:
@@ -78,7 +78,9 @@ def feature_log_evidence(state: SlamState) -> float:
     track = state.tracklets.of_observation[state.rows]
     latent, variance, category = seen.latent, seen.latent_variance, seen.category
     members: dict[int, dict[int, list[int]]] = {}
-    for row, j, t in zip(state.rows.tolist(), state.landmark.tolist(), track.tolist()):
+    for row, j, t, weight in zip(state.rows.tolist(), state.landmark.tolist(), track.tolist(), state.weight.tolist()):
+        if weight <= 0.5:
+            continue
         members.setdefault(j, {}).setdefault(t, []).append(row)
     value = 0.0
     correlation = state.config.latent_correlation or 0.0
