@@ -117,6 +117,25 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
     )
 
 
+def rates_report(found: Associations, frames: int) -> dict[str, float]:
+    """Rates with their posterior, by name: a Poisson rate given its expected count is gamma, a share is beta."""
+    model, n = found.model, len(found.background)
+    false, unmapped = float(found.background.sum()) + 0.5, float(found.new.sum()) + 0.5
+    share = false / (n + 1.0)
+    return {
+        "clutter_per_frame": false / frames,
+        "clutter_per_frame_std": float(np.sqrt(false)) / frames,
+        "unmapped_per_frame": unmapped / frames,
+        "unmapped_per_frame_std": float(np.sqrt(unmapped)) / frames,
+        "clutter_share": share,
+        "clutter_share_std": float(np.sqrt(share * (1 - share) / (n + 2.0))),
+        "detection_probability": float(np.median(model.detection_probability)),
+        "detection_concentration": model.concentration,
+        "score_slope": model.score_slope,
+        "score_correlation": model.score_correlation,
+    }
+
+
 def moving_detections(state: SlamState) -> Bool[np.ndarray, " n"]:
     """Detections of tracks that move."""
     track = state.tracklets.of_observation

@@ -23,7 +23,7 @@ from nolbo_ppl.inference.slam.loop_candidates import Pairs, TrackletFeatures, ca
 from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
 from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
-from nolbo_ppl.inference.slam.slam_state import SlamState
+from nolbo_ppl.inference.slam.slam_state import SlamState, object_log_density
 
 LINK_ROTATION = 0.05
 """Scale of the rotation between two linked landmarks that are oriented, rad."""
@@ -136,7 +136,7 @@ def soft_assignment(
 def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
     """The E-step of a state as links, and its log evidence."""
     a, b, weight, evidence = soft_assignment(
-        pairs, state.features, clusters_of(state), float(np.log(state.noise.new_rate)), state.config
+        pairs, state.features, clusters_of(state), object_log_density(state.noise), state.config
     )
     return make_links(state, a, b, weight), evidence
 
@@ -167,7 +167,7 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
     phase = "em"
     if state.closing:
         phase = "constellation"
-        log_new = float(np.log(density(state)))
+        log_new = object_log_density(state.noise)
         # Closed tracklets rest until the soft E-step decides every link anew.
         fresh = pairs.select(~np.isin(pairs.a, list(state.closed)))
         accepted = close_constellations(
@@ -210,8 +210,3 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
         graph_error=error,
     )
     return state, info
-
-
-def density(state: SlamState) -> float:
-    """Density of landmarks in view, per m^3: five times the rate of new ones (one detection in five is of a new one)."""
-    return 5.0 * state.noise.new_rate

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
-from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections
+from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections, rates_report
 from nolbo_ppl.inference.slam.em import make_links
+from nolbo_ppl.inference.slam.frame_model import exposures_of, initial_frame_model
 from nolbo_ppl.inference.slam.graph import Links, SlamEstimate, linearise, optimise
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
@@ -21,10 +22,13 @@ from nolbo_ppl.inference.slam.initialise import (
     linearise_state,
     tracklet_features,
 )
-from nolbo_ppl.inference.slam.loop_candidates import candidate_pairs, posterior_samples
+from nolbo_ppl.inference.slam.loop_candidates import Pairs, candidate_pairs, posterior_samples
 from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry, settle_odometry
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
+from nolbo_ppl.inference.slam.slam_state import object_log_density
 
+LARGEST_MISSED = 6.0
+"""Most that missed detections may speak for one landmark instead of two, nats: occlusions make misses alike."""
 MERGE_LOG_ODDS = 3.0
 """Two landmarks are merged in the end when one explains them better by this many nats."""
 BROKEN_LINK = 6.0
@@ -73,13 +77,32 @@ def solve_clean(state: SlamState, repeats: int = 3, tolerance: float = 1e-8) -> 
     return state
 
 
+def missed_log_ratio(state: SlamState, pairs: Pairs) -> Float[np.ndarray, " p"]:
+    """Log probability of the frames with and without a detection if both landmarks are one, less that if they are two."""
+    seen, m = state.measurements, len(state.estimate.T_world_landmark)
+    T_world_camera, place = state.estimate.T_world_camera, state.estimate.T_world_landmark[:, :3, 3]
+    model = initial_frame_model(seen, state.config, len(state.problem))
+    exposures = exposures_of(model, T_world_camera, place)
+    hits = np.bincount(state.landmark, state.weight, minlength=m).astype(np.float64)
+    number, _ = exposures.totals(model, m)
+    # One probability for all: that of the map as it is, which duplicates make too low, not too high.
+    chance = np.full(len(pairs), (hits.sum() + 1.0) / (np.maximum(number, hits).sum() + 2.0))
+    a, b, count = hits[pairs.a], hits[pairs.b], np.maximum(number, hits)
+    one = model.log_pattern(a + b, np.maximum(np.maximum(count[pairs.a], count[pairs.b]), a + b), chance)
+    two = model.log_pattern(a, count[pairs.a], chance) + model.log_pattern(b, count[pairs.b], chance)
+    return np.minimum(one - two, LARGEST_MISSED)
+
+
 def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
-    """Join landmarks that one explains better: never seen together, close under the final covariance, alike."""
+    """Join landmarks that one explains better: never seen together, close under the final covariance, alike.
+
+    Two objects in view would each have been missed wherever the other was detected; one was not.
+    """
     samples = posterior_samples(linearise_state(state), state.estimate, state.config.samples, rng)
     frames = frames_of_landmarks(state)
     spans = replace(state.features, first=np.arange(len(frames)), last=np.arange(len(frames)))  # every pair once
     pairs = candidate_pairs(state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale)
-    value = pairs.log_position + pairs.log_feature - np.log(state.noise.new_rate)
+    value = pairs.log_position + pairs.log_feature - object_log_density(state.noise) + missed_log_ratio(state, pairs)
     apart = np.array([frames[i].isdisjoint(frames[j]) for i, j in zip(pairs.a, pairs.b)], dtype=bool)
     good = np.flatnonzero((value > MERGE_LOG_ODDS) & apart)
     if not len(good):
@@ -157,7 +180,9 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
             break
         state = solve_soft(drop_empty(final, 0.5))
         final, found = reassociate(state, rng)
-    return replace(final, rows=state.rows, landmark=state.landmark, weight=state.weight, features=state.features), found
+    noise = replace(final.noise, report=final.noise.report | rates_report(found, len(state.problem)))
+    final = replace(final, rows=state.rows, landmark=state.landmark, weight=state.weight, features=state.features, noise=noise)
+    return final, found
 
 
 def final_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:

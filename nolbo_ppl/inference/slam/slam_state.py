@@ -70,6 +70,14 @@ class SlamState:
         return link_scale(self.noise)
 
 
+def object_log_density(noise: NoiseModel) -> float:
+    """Log density of objects in view, per m^3: the prior of "another object" wherever two tracklets or landmarks are compared.
+
+    That is the density of detections a frame, five times the rate of first ones. A gap's density is weighed against it.
+    """
+    return float(np.log(5.0 * noise.new_rate))
+
+
 def link_scale(noise: NoiseModel) -> float:
     """Half the median scale of a detected position, m."""
     if not len(noise.position_covariance):

@@ -12,6 +12,8 @@ from scipy.stats import multivariate_normal
 
 from nolbo_ppl.geometry.pose import inverse, se3_exp, transform
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
+from nolbo_ppl.inference.slam.data_association import Associations
+from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, ambiguity, mixture_covariances
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -71,9 +73,8 @@ def test_mixture_covariance_and_words() -> None:
     moved[3] = moved[3] @ se3_exp(away)
     other = replace(state, estimate=replace(state.estimate, T_world_camera=moved))
     nothing = np.zeros(0, int)
-    from nolbo_ppl.inference.slam.data_association import Associations
-
-    empty = Associations(nothing, nothing, np.zeros(0), np.zeros(4), np.ones(4), np.zeros(4), True)
+    model = initial_frame_model(state.measurements, EXACT, 4)
+    empty = Associations(nothing, nothing, np.zeros(0), np.zeros(4), np.ones(4), np.zeros(4), True, np.ones(1), model)
     maps = (MapHypothesis(0.7, 0.0, state, empty), MapHypothesis(0.3, -0.85, other, empty))
     found = mixture_covariances(maps, state.estimate.T_world_camera, np.array([2, 3]))
     own = [h.pose_covariances(np.array([2, 3])) for h in maps]
