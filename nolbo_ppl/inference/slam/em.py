@@ -160,7 +160,14 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
     samples = posterior_samples(linearisation, state.estimate, config.samples, rng)
     inflation = config.annealing[min(state.iteration, len(config.annealing) - 1)]
     pairs = candidate_pairs(
-        state.estimate, samples, state.features, state.prior, config, inflation=inflation, floor=state.link_scale
+        state.estimate,
+        samples,
+        state.features,
+        state.prior,
+        config,
+        inflation=inflation,
+        floor=state.link_scale,
+        links=None if state.closing else state.links,
     )
     closings = 0
     evidence = 0.0

@@ -29,6 +29,8 @@ SAME_MAP = 1.0
 """Runs whose trajectories are closer than this many typical detection scales are one hypothesis."""
 AMBIGUOUS = 0.05
 """A rival with more weight than this makes the answer ambiguous."""
+RAISED = 3.0
+"""Stated scales of the odometry raised by more than this at the end of a run: it is repeated from its start."""
 LEAST_WEIGHT = 1e-4
 """Hypotheses of less weight are not kept."""
 
@@ -86,6 +88,25 @@ def start_of_run(state: SlamState, k: int) -> SlamState:
     return replace(state, noise=noise, config=config)
 
 
+def raised_odometry(start: SlamState, end: SlamState) -> SlamState | None:
+    """The start with the odometry's scales of the end, where stated ones were raised by more than `RAISED`; else None."""
+    if not any(stated_scales(start.problem, start.config)) or not len(start.noise.rotation_step):
+        return None
+    ratios = (
+        float(np.median(end.noise.rotation_step / start.noise.rotation_step)),
+        float(np.median(end.noise.translation_step / start.noise.translation_step)),
+    )
+    if max(ratios) < RAISED:
+        return None
+    noise = replace(
+        start.noise,
+        rotation_step=start.noise.rotation_step * max(ratios[0], 1.0),
+        translation_step=start.noise.translation_step * max(ratios[1], 1.0),
+        warnings=end.noise.warnings,
+    )
+    return replace(start, noise=noise)
+
+
 def run_to_end(
     state: SlamState,
     iterate: Callable[[SlamState, Callable[[SlamState, EmStepInfo], None]], tuple[SlamState, tuple[EmStepInfo, ...]]],
@@ -115,11 +136,17 @@ def explore(
     same = SAME_MAP * 2 * state.link_scale
     for k in range(max(state.config.hypotheses, 1)):
         runs.append(run_to_end(start_of_run(state, k), iterate, on_step))
+        if k == 0 and (raised := raised_odometry(state, runs[0].state)) is not None:
+            # Loops were judged under a drift far too small: once more under what the map now says.
+            state = raised
+            runs[0] = run_to_end(state, iterate, on_step)
         distance = trajectory_distance(runs[0].state.estimate.T_world_camera, runs[-1].state.estimate.T_world_camera)
         if k == 1 and distance < same and abs(runs[0].log_evidence - runs[1].log_evidence) < 5.0:
             break
         if len(state.static) < 2:
             break
+    if len(runs) > 2:  # and the map without any loop: runs that disagree may all be wrong
+        runs.append(run_to_end(state, lambda start, _: (start, ()), None))
     runs.sort(key=lambda run: -run.log_evidence)
     distinct: list[Run] = []
     for run in runs:

@@ -31,6 +31,7 @@ from nolbo_ppl.inference.slam.graph import (
 )
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
+from nolbo_ppl.inference.slam.noise.absurd_values import without_absurd_values
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, stated_scales
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
@@ -152,7 +153,9 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
         InputError: the problem is malformed (see `SlamProblem`).
         GraphError: GTSAM could not solve the graph.
     """
+    problem, set_aside = without_absurd_values(problem)
     noise = estimate_noise(problem, config)
+    noise = replace(noise, warnings=(*set_aside, *noise.warnings))
     prior = fit_prior(problem.observations, config, noise)
     tracklets = build_tracklets(problem, noise, config, prior)
     state = init_from_tracklets(problem, config, noise, prior, tracklets)
@@ -199,7 +202,7 @@ def init_from_tracklets(
     for repeat in range(3):
         estimate, _, error = optimise(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
         state = replace(state, estimate=estimate, graph_error=error)
-        state = replace(calibrate(state) if repeat < 2 else state)
+        state = calibrate(state) if repeat < 2 else state
         state = replace(state, weight=inlier_weights(state))
         if repeat == 0:
             state = odometry_by_evidence(state)

@@ -13,10 +13,12 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
+from nolbo_ppl.inference.slam.graph import Linearisation, Links, SlamEstimate
 from nolbo_ppl.inference.slam.orientation import orientation_log_density
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
+LINK_SHARE = 0.9
+"""Most of a gap's information that is taken off for its own link: the rest is the sampled covariance's error."""
 POSITION_GATE = 25.0
 """Squared Mahalanobis distance beyond which two tracklets are no candidates."""
 
@@ -113,6 +115,53 @@ def gap_covariance(samples: PosteriorSamples, a: Int[np.ndarray, " p"], b: Int[n
     return out
 
 
+def without_own_links(
+    gap: Float[np.ndarray, "p 3"],
+    covariance: Float[np.ndarray, "p 3 3"],
+    information: Float[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3 3"]]:
+    """Gaps and their covariances in the graph without the pairs' own links, which pull each gap to zero.
+
+    A link of information i makes `C^-1 = C0^-1 + i I` and `C^-1 g = C0^-1 g0`: judged under a graph that holds it, a false link
+    speaks for itself (2 nats of 30 false ones). Information that a link alone holds cannot be taken off by difference: it
+    is kept to `LINK_SHARE` of the whole.
+
+    Args:
+        gap: under the graph with links.
+        covariance: of the gaps under the same graph.
+        information: of each pair's own link in the graph, its kernel counted, m^-2; 0 where there is none.
+    """
+    linked = np.flatnonzero(information > 0)
+    if not len(linked):
+        return gap, covariance
+    gap, covariance = gap.copy(), covariance.copy()
+    value, vector = np.linalg.eigh(covariance[linked])
+    share = np.minimum(information[linked, None] * value, LINK_SHARE)
+    free = value / (1 - share)  # 1 / (1 / v - i)
+    along = np.einsum("pji,pj->pi", vector, gap[linked]) / (1 - share)
+    gap[linked] = np.einsum("pij,pj->pi", vector, along)
+    covariance[linked] = np.einsum("pij,pj,pkj->pik", vector, free, vector)
+    return gap, covariance
+
+
+def link_information(
+    links: Links, estimate: SlamEstimate, width: float | None, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
+) -> Float[np.ndarray, " p"]:
+    """Information that the link of each pair holds on its gap in the graph, m^-2; 0 where it has none."""
+    if not len(links) or not len(a):
+        return np.zeros(len(a))
+    position = estimate.T_world_landmark[:, :3, 3]
+    information = links.weight / links.scale[:, 1] ** 2
+    if width is not None:  # the Cauchy kernel's weight at the estimate, of the position alone
+        square = information * np.sum((position[links.a] - position[links.b]) ** 2, axis=1)
+        information = information / (1 + square / width**2)
+    number = len(position)
+    key, total = np.unique(links.a * number + links.b, return_inverse=True)
+    summed = np.bincount(total, weights=information)
+    place = np.minimum(np.searchsorted(key, a * number + b), len(key) - 1)
+    return np.where(key[place] == a * number + b, summed[place], 0.0)
+
+
 def candidate_pairs(
     estimate: SlamEstimate,
     samples: PosteriorSamples,
@@ -122,12 +171,14 @@ def candidate_pairs(
     *,
     inflation: float,
     floor: float,
+    links: Links | None = None,
 ) -> Pairs:
     """All pairs (newer, older) that are never seen together and whose gap is inside the gate, with their evidence.
 
     Args:
         inflation: factor on the sampled covariances (annealing).
         floor: standard deviation added to each coordinate of the gap, m (what one object's position varies by).
+        links: links of the graph the samples are of; each pair is judged without its own.
     """
     position = estimate.T_world_landmark[:, :3, 3]
     m, _, count = samples.position.shape
@@ -150,8 +201,11 @@ def candidate_pairs(
     a, b = np.concatenate(lists_a), np.concatenate(lists_b)
     compatible = prior.category_log_ratio(features.category[a], features.category[b]) > -20
     a, b = a[compatible], b[compatible]
-    covariance = inflation * gap_covariance(samples, a, b) + floor**2 * np.eye(3)
-    gap = position[a] - position[b]
+    gap, covariance = position[a] - position[b], gap_covariance(samples, a, b)
+    if links is not None:
+        own = link_information(links, estimate, config.robust_width, a, b)
+        gap, covariance = without_own_links(gap, covariance, own)
+    covariance = inflation * covariance + floor**2 * np.eye(3)
     square, log_det = squared_distance(gap, covariance)
     inside = square < POSITION_GATE
     a, b = a[inside], b[inside]

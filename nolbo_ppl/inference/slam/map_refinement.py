@@ -152,6 +152,20 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
     return replace(state, features=features)
 
 
+def fit_odometry(state: SlamState, rounds: int = 4, tolerance: float = 0.05) -> SlamState:
+    """Scales of the odometry to the fixed point of the evidence on the closed map, solved anew after each change."""
+    if len(state.problem) < 3:
+        return state
+    for _ in range(rounds):
+        before = np.array([np.median(state.noise.rotation_step), np.median(state.noise.translation_step)])
+        state = refine_odometry(state, linearise_state(state))
+        after = np.array([np.median(state.noise.rotation_step), np.median(state.noise.translation_step)])
+        if (np.abs(np.log(after / before)) < tolerance).all():
+            break
+        state = solve_clean(state, repeats=1)
+    return state
+
+
 def finish(state: SlamState) -> tuple[SlamState, Associations]:
     """Merge, solve clean, associate every detection with the map, solve again: the final state and its associations."""
     rng = np.random.default_rng([state.config.seed, 104729])
@@ -165,7 +179,7 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     state, _ = reassociate(state, rng)
     state = solve_soft(drop_empty(state, 0.5))
     if len(state.rows):
-        state = refine_odometry(state, linearise_state(state))
+        state = fit_odometry(state)
         state, (rotation, translation) = settle_odometry(state)
         state = solve_soft(state)
         if min(rotation, translation) < 1:

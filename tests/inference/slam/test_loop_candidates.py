@@ -178,3 +178,26 @@ def test_clusters_are_components_of_strong_links() -> None:
         best = int(np.argmax(w))
         if a[best] != b[best] and w[best] > 0.5 and frames[a[best]].isdisjoint(frames[b[best]]):
             assert found[a[best]] == found[b[best]]
+
+
+def test_a_link_does_not_speak_for_itself() -> None:
+    """Two tracklets with drift between them, linked: judged without the link they are as before it."""
+    from nolbo_ppl.inference.slam.loop_candidates import link_information, without_own_links
+
+    rng = np.random.default_rng(5)
+    A = rng.standard_normal((3, 3))
+    before, gap = A @ A.T + 0.5 * np.eye(3), np.array([1.0, -0.5, 0.7])
+    information = 1.5
+    after = np.linalg.inv(np.linalg.inv(before) + information * np.eye(3))
+    pulled = after @ np.linalg.inv(before) @ gap
+    found_gap, found = without_own_links(np.tile(pulled, (2, 1)), np.tile(after, (2, 1, 1)), np.array([information, 0.0]))
+    share = np.max(np.linalg.eigvalsh(after)) * information
+    assert share < 0.9  # nothing is cut here
+    np.testing.assert_allclose(found_gap, [gap, pulled], atol=1e-10)
+    np.testing.assert_allclose(found, [before, after], atol=1e-10)
+    # The information is that of the weighted link under its Cauchy kernel at the gap.
+    joined = links([3, 4], [1, 0], [0.8, 0.5])
+    position = np.zeros((5, 3))
+    position[3, 0] = 2.0
+    found_information = link_information(joined, poses(position), 1.5, np.array([3, 4, 4]), np.array([1, 0, 2]))
+    np.testing.assert_allclose(found_information, [0.8 / (1 + 0.8 * 4 / 1.5**2), 0.5, 0.0])

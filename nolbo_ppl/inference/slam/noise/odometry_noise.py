@@ -86,8 +86,10 @@ def odometry_by_evidence(state: SlamState) -> SlamState:
     the posterior's mean: too wide a drift is annealed away as loops close, too narrow a one closes none.
     """
     free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
+    if not all(free):
+        state = raise_stated(state, (not free[0], not free[1]))
     window = densest_window(state)
-    if len(window.rows) < 20 or len(window.problem) < 10:
+    if not any(free) or len(window.rows) < 20 or len(window.problem) < 10:
         return state
     report, warnings = dict(state.noise.report), list(state.noise.warnings)
     evidence = scale_evidence(window)
@@ -98,14 +100,6 @@ def odometry_by_evidence(state: SlamState) -> SlamState:
         for name, spread, is_free in zip(("rotation", "translation"), found.deviation, free):
             if is_free:
                 report[f"odometry_{name}_log_spread"] = float(spread)
-    if not all(free):
-        stated = (not free[0], not free[1])
-        found = scale_posterior(evidence, stated, grid=STATED_GRID, width=1e3)
-        for axis, name in enumerate(("rotation", "translation")):
-            ratio = float(np.exp(found.mean[axis]))
-            if stated[axis] and ratio > TOO_SMALL and found.over_one > SURE_GAIN:
-                warnings.append(f"stated odometry {name} scale is too small: the evidence favours {ratio:.3g} times as much")
-                factors[axis] = ratio if state.config.correct_scales else 1.0
     return _scaled(state, factors, report, warnings)
 
 
@@ -139,6 +133,31 @@ def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[tup
     return out[0], out[1]
 
 
+def raise_stated(state: SlamState, stated: tuple[bool, bool]) -> SlamState:
+    """Stated scales that the evidence of the map says are too small by more than a third: reported, and raised."""
+    window = densest_window(state, LARGEST_WINDOW)
+    if len(window.problem) < 3 or len(window.rows) < 20:
+        return state
+    evidence = scale_evidence(window)
+    one = evidence.solve(1.0, 1.0)[0]
+    # A first look far up, before the grid is paid for.
+    far = max(
+        evidence.solve(float(f) if stated[0] else 1.0, float(f) if stated[1] else 1.0)[0] for f in np.exp(STATED_GRID[1::2])
+    )
+    near = max(evidence.solve(2.0 if stated[0] else 1.0, 1.0)[0], evidence.solve(1.0, 2.0 if stated[1] else 1.0)[0])
+    if max(far, near) < one + SURE_GAIN:
+        return state
+    found = scale_posterior(evidence, stated, grid=STATED_GRID, width=1e3)
+    report, warnings, factors = dict(state.noise.report), list(state.noise.warnings), np.ones(2)
+    for axis, name in enumerate(("rotation", "translation")):
+        ratio = float(np.exp(found.mean[axis]))
+        if stated[axis] and ratio > TOO_SMALL:
+            warnings = [w for w in warnings if not w.startswith(f"stated odometry {name}")]
+            warnings.append(f"stated odometry {name} scale is too small: the evidence favours {ratio:.3g} times as much")
+            factors[axis] = ratio if state.config.correct_scales else 1.0
+    return _scaled(state, factors, report, warnings)
+
+
 def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     """The scales the answer is given with, and factors on them for the trajectory: what nothing supports is not corrected.
 
@@ -148,7 +167,11 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     scale. Where scales are guesses a warning says so, and how far half and twice of them would move the trajectory.
     """
     free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
-    if not any(free) or len(state.problem) < 3 or not len(state.rows):
+    if len(state.problem) < 3 or not len(state.rows):
+        return state, (1.0, 1.0)
+    if not all(free):
+        state = raise_stated(state, (not free[0], not free[1]))
+    if not any(free):
         return state, (1.0, 1.0)
     report, warnings = dict(state.noise.report), list(state.noise.warnings)
     names = ("rotation", "translation")
