@@ -130,3 +130,43 @@ def test_true_associations_are_least_squares() -> None:
     best = least_squares(residuals, start, xtol=1e-14, ftol=1e-14).x
     np.testing.assert_allclose(found.T_world_camera[1:, :3, 3], best[: 6 * (n - 1)].reshape(-1, 6)[:, 3:], atol=2e-4)
     np.testing.assert_allclose(found.T_world_landmark[:, :3, 3], best[6 * (n - 1) :].reshape(m, 3), atol=2e-4)
+
+
+def test_runs_begin_differently_where_nothing_is_stated() -> None:
+    from nolbo_ppl.inference.slam.hypotheses import raised_odometry, start_of_run
+
+    state = standing(np.ones((4, 3)) + 0.1 * np.arange(12).reshape(4, 3), np.zeros(4, int))
+    assert start_of_run(state, 0) is state
+    stated, free = start_of_run(state, 1), start_of_run(replace(state, config=SlamConfig()), 1)
+    np.testing.assert_array_equal(stated.noise.rotation_step, state.noise.rotation_step)
+    np.testing.assert_allclose(free.noise.rotation_step, 3 * state.noise.rotation_step)
+    assert stated.config.seed != state.config.seed and stated.config.annealing[0] > state.config.annealing[0]
+    # A run is repeated where the end raised what was stated, not otherwise.
+    wider = replace(state, noise=replace(state.noise, rotation_step=10 * state.noise.rotation_step, warnings=("said",)))
+    again = raised_odometry(state, wider)
+    assert again is not None and again.noise.warnings == ("said",)
+    np.testing.assert_allclose(again.noise.rotation_step, 10 * state.noise.rotation_step)
+    np.testing.assert_array_equal(again.noise.translation_step, state.noise.translation_step)
+    assert raised_odometry(state, state) is None
+
+
+@pytest.mark.slow
+def test_map_does_not_depend_on_the_seed() -> None:
+    """Identical objects without orientations: two seeds end at one trajectory, or the answer says that it is ambiguous."""
+    from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+    from nolbo_ppl.inference.slam import solve
+
+    rng = np.random.default_rng(123)
+    truth = simulate_circuit(rng, laps=2, radius=20.0, frames_per_lap=40)
+    world = simulate_drive(
+        truth,
+        rng,
+        world=WorldConfig(objects=20, categories=1, latent_dim=0),
+        detector=DetectorConfig(rotation_scale=None),
+        odometry_rotation_scale=0.01,
+    )
+    problem = SlamProblem(world.odometry, world.observations)
+    runs = [solve(problem, SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01, seed=s)) for s in (0, 7)]
+    assert all(sum(h.weight for h in run.hypotheses) == pytest.approx(1.0, abs=1e-3) for run in runs)
+    apart = trajectory_distance(runs[0].T_world_camera, runs[1].T_world_camera)
+    assert apart < 0.1 or all(ambiguity(run.hypotheses) for run in runs)
