@@ -152,6 +152,13 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
     return replace(state, features=features)
 
 
+def solve_settled(state: SlamState, factors: tuple[float, float]) -> SlamState:
+    """`solve_soft` with the odometry's scales times the factors of `settle_odometry`; the state keeps its own scales."""
+    noise = state.noise
+    stiff = replace(noise, rotation_step=noise.rotation_step * factors[0], translation_step=noise.translation_step * factors[1])
+    return replace(solve_soft(replace(state, noise=stiff)), noise=noise)
+
+
 def fit_odometry(state: SlamState, rounds: int = 4, tolerance: float = 0.05) -> SlamState:
     """Scales of the odometry to the fixed point of the evidence on the closed map, solved anew after each change."""
     if len(state.problem) < 3:
@@ -178,21 +185,16 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     state = solve_clean(state)
     state, _ = reassociate(state, rng)
     state = solve_soft(drop_empty(state, 0.5))
+    factors = (1.0, 1.0)
     if len(state.rows):
         state = fit_odometry(state)
-        state, (rotation, translation) = settle_odometry(state)
-        state = solve_soft(state)
-        if min(rotation, translation) < 1:
-            noise = state.noise
-            stiff = replace(
-                noise, rotation_step=noise.rotation_step * rotation, translation_step=noise.translation_step * translation
-            )
-            state = replace(state, estimate=solve_soft(replace(state, noise=stiff)).estimate)
+        state, factors = settle_odometry(state)
+        state = solve_settled(state, factors)
     final, found = reassociate(state, rng)
     for _ in range(3):  # landmarks that lost what placed them are no part of the answer
         if not len(found.existence) or np.bincount(found.landmark, found.weight, minlength=len(found.existence)).min() >= 0.5:
             break
-        state = solve_soft(drop_empty(final, 0.5))
+        state = solve_settled(drop_empty(final, 0.5), factors)
         final, found = reassociate(state, rng)
     noise = replace(final.noise, report=final.noise.report | rates_report(found, len(state.problem)))
     final = replace(final, rows=state.rows, landmark=state.landmark, weight=state.weight, features=state.features, noise=noise)
