@@ -1,77 +1,158 @@
-"""The online system's factor graph on iSAM2: poses, landmarks, observations and links, added and solved in small steps."""
+"""The online system's factor graph on iSAM2: factors are added, moved to another landmark, and taken away in small steps.
+
+Every factor is kept here as numbers besides its slot in iSAM2. That is what lets two landmarks become one (the factors of the
+one are handed to the other), a stretch of keyframes become one (`condense`), and the whole be written to a file.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.geometry.pose import adjoint, inverse
 from nolbo_ppl.inference.slam.graph import (
     GAUGE_SCALE,
-    Links,
+    LOOSE_ROTATION,
+    PRIOR_POSITION_RATIO,
+    PRIOR_ROTATION,
+    ObservationFactors,
     SlamEstimate,
-    add_landmark_priors,
-    add_links,
-    add_observation_factors,
     landmark_key,
     named_error,
     pose_key,
     resolve_observations,
 )
-from nolbo_ppl.inference.slam.measurements import Measurements
-from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
+from nolbo_ppl.inference.slam.incremental.condensation import condensed_observations
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
 RELINEARISE_ROTATION, RELINEARISE_POSITION = 0.05, 10.0
 """Changes in rad and m beyond which a variable is linearised anew."""
+LEAST_WEIGHT = 1e-3
+"""Observations of lower weight are left out."""
+GAUGE, PRIOR, STEP, OBSERVATION = range(4)
+"""Kinds of factors: of a first pose, of a landmark, between poses, of a landmark from a pose."""
 
 
-class OnlineGraph:
+@dataclass
+class Factor:
+    """One factor of the running graph."""
+
+    kind: int
+    """GAUGE, PRIOR, STEP or OBSERVATION."""
+    a: int
+    """Pose, or the landmark of a PRIOR."""
+    b: int
+    """Later pose of a STEP, landmark of an OBSERVATION, else -1."""
+    T: Float[np.ndarray, "4 4"]
+    """Measured pose (GAUGE, PRIOR) or relative pose."""
+    covariance: Float[np.ndarray, "6 6"]
+    """Its covariance, [rotation rad, position m]."""
+    slot: int = -1
+    """Where iSAM2 holds it; -1 while it waits."""
+
+    def keys(self) -> tuple[int, ...]:
+        """Keys of its variables."""
+        if self.kind == PRIOR:
+            return (landmark_key(self.a),)
+        if self.kind == GAUGE:
+            return (pose_key(self.a),)
+        return pose_key(self.a), pose_key(self.b) if self.kind == STEP else landmark_key(self.b)
+
+    def build(self) -> gtsam.NonlinearFactor:
+        """As GTSAM has it."""
+        root = np.linalg.inv(np.linalg.cholesky(self.covariance))
+        model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+        keys, T = self.keys(), gtsam.Pose3(self.T)
+        if len(keys) == 1:
+            return gtsam.PriorFactorPose3(keys[0], T, model)
+        return gtsam.BetweenFactorPose3(keys[0], keys[1], T, model)
+
+
+def compose(first: Factor, second: Factor) -> Factor:
+    """Two steps that follow each other as one: `T = T_1 T_2`, `C = Ad(T_2^-1) C_1 Ad(T_2^-1)' + C_2`."""
+    carry = adjoint(inverse(second.T))
+    return Factor(STEP, first.a, second.b, first.T @ second.T, carry @ first.covariance @ carry.T + second.covariance)
+
+
+class IncrementalGraph:
     """Factors and first values wait until `commit`; `pose` and `landmark` answer with what is known now."""
 
     def __init__(self) -> None:
-        parameters = gtsam.ISAM2Params()
-        # Between-factors are linear in positions: only rotations that have moved need a new linearisation point.
-        thresholds = gtsam.ISAM2ThresholdMap()
-        for symbol in "xl":
-            thresholds.insert((symbol, np.repeat([RELINEARISE_ROTATION, RELINEARISE_POSITION], 3)))
-        parameters.setRelinearizeThreshold(thresholds)
-        parameters.relinearizeSkip = 10
-        # Landmarks hang on weak priors beside a nearly fixed first pose: QR takes that spread, Cholesky does not.
-        parameters.setFactorization("QR")
-        self.isam = gtsam.ISAM2(parameters)
-        self.graph = gtsam.NonlinearFactorGraph()
-        self.values = gtsam.Values()
+        self.isam = new_isam()
+        self.factors: dict[int, Factor] = {}
+        self.of_pose: dict[int, set[int]] = {}
+        self.of_landmark: dict[int, set[int]] = {}
+        self.first_values: dict[int, Float[np.ndarray, "4 4"]] = {}
+        self.added: list[int] = []
+        self.removed: list[int] = []
+        self.serial = 0
         self.poses = 0
         self.landmarks = 0
+        self.attached: dict[int, tuple[int, Float[np.ndarray, "4 4"]]] = {}
+        self.carried: dict[int, list[int]] = {}
 
-    def add_first_pose(self, T_world_camera: Float[np.ndarray, "4 4"]) -> None:
-        """The pose everything hangs on."""
-        model = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE)
-        self.graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(T_world_camera), model))
-        self.values.insert(pose_key(0), gtsam.Pose3(T_world_camera))
-        self.poses = 1
+    # -- factors ------------------------------------------------------------------------------------------------------
+
+    def add(self, factor: Factor) -> int:
+        """Let a factor wait; returns its number."""
+        number = self.serial
+        self.serial += 1
+        self.factors[number] = factor
+        self.added.append(number)
+        for holder, member in self._members(factor):
+            holder.setdefault(member, set()).add(number)
+        return number
+
+    def remove(self, number: int) -> None:
+        """Take a factor out with the next `commit`."""
+        factor = self.factors.pop(number)
+        for holder, member in self._members(factor):
+            holder[member].discard(number)
+            if not holder[member]:
+                del holder[member]
+        if factor.slot >= 0:
+            self.removed.append(factor.slot)
+        else:
+            self.added.remove(number)
+
+    def _members(self, factor: Factor) -> list[tuple[dict[int, set[int]], int]]:
+        if factor.kind == PRIOR:
+            return [(self.of_landmark, factor.a)]
+        if factor.kind == GAUGE:
+            return [(self.of_pose, factor.a)]
+        return [(self.of_pose, factor.a), (self.of_pose if factor.kind == STEP else self.of_landmark, factor.b)]
+
+    def add_first_pose(
+        self, T_world_camera: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"] | None = None
+    ) -> None:
+        """The pose a drive hangs on: held fixed, or known with this covariance."""
+        self.first_values[pose_key(self.poses)] = T_world_camera
+        self.add(Factor(GAUGE, self.poses, -1, T_world_camera, GAUGE_SCALE**2 * np.eye(6) if covariance is None else covariance))
+        self.poses += 1
 
     def add_pose(
         self, step: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"], T_world_camera: Float[np.ndarray, "4 4"]
     ) -> None:
         """The next pose, at its first value, and the odometry step that leads to it."""
-        model = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        self.graph.add(gtsam.BetweenFactorPose3(pose_key(self.poses - 1), pose_key(self.poses), gtsam.Pose3(step), model))
-        self.values.insert(pose_key(self.poses), gtsam.Pose3(T_world_camera))
+        self.first_values[pose_key(self.poses)] = T_world_camera
+        self.add(Factor(STEP, self.poses - 1, self.poses, step, covariance))
         self.poses += 1
 
     def add_landmark(self, T_world_landmark: Float[np.ndarray, "4 4"], distance: float) -> int:
         """A new landmark with its weak prior; returns its number."""
-        self.values.insert(landmark_key(self.landmarks), gtsam.Pose3(T_world_landmark))
-        add_landmark_priors(self.graph, T_world_landmark[None], distance, first=self.landmarks)
+        self.first_values[landmark_key(self.landmarks)] = T_world_landmark
+        sigmas = np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [PRIOR_POSITION_RATIO * max(distance, 1e-3)] * 3)
+        self.add(Factor(PRIOR, self.landmarks, -1, T_world_landmark, np.diag(sigmas**2)))
         self.landmarks += 1
         return self.landmarks - 1
 
     def observe(
         self,
-        measurements: Measurements,
+        problem: SlamProblem,
         noise: NoiseModel,
         config: SlamConfig,
         rows: list[int],
@@ -79,46 +160,208 @@ class OnlineGraph:
         T_world_camera: Float[np.ndarray, "4 4"],
         landmarks: list[int],
     ) -> None:
-        """Factors of detections of one keyframe (`measurements` hold that keyframe alone)."""
+        """Factors of detections of one keyframe (`problem` holds that keyframe alone)."""
         if not rows:
             return
         estimate = SlamEstimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
-        count = len(rows)
-        factors = resolve_observations(
-            measurements, T_world_camera[None], noise, config, estimate, np.array(rows), np.arange(count), np.ones(count)
-        )
-        factors = replace(factors, frame=np.full_like(factors.frame, frame), landmark=np.array(landmarks)[factors.landmark])
-        add_observation_factors(self.graph, factors)
+        found = resolve_observations(problem, noise, config, estimate, np.array(rows), np.arange(len(rows)), np.ones(len(rows)))
+        self._add_observations(found, frame, landmarks)
 
-    def add_links(self, links: Links) -> None:
-        """Tie landmarks together; the linearisation points follow with the next keyframes."""
-        add_links(self.graph, links, None)
+    def _add_observations(self, found: ObservationFactors, frame: int, landmarks: list[int]) -> None:
+        for k in np.flatnonzero(found.weight > LEAST_WEIGHT):
+            j, covariance = landmarks[int(found.landmark[k])], found.covariance[k] / found.weight[k]
+            self.add(Factor(OBSERVATION, frame, j, found.T_camera_landmark[k], covariance))
 
-    def commit(self) -> None:
-        """Hand what waits to iSAM2.
+    # -- fewer variables ----------------------------------------------------------------------------------------------
+
+    def merge(self, a: int, b: int, T_a_b: Float[np.ndarray, "4 4"], *, agree: bool = True) -> None:
+        """Hand all observations of landmark a to landmark b, and drop a.
+
+        Args:
+            T_a_b: the turn between their axes (half turn or symmetry), `L_b = L_a T_a_b`.
+            agree: whether their orientations do; if not, a's say nothing from now on.
+        """
+        turn = np.kron(np.eye(2), T_a_b[:3, :3])
+        for number in sorted(self.of_landmark[a]):
+            factor = self.factors[number]
+            self.remove(number)
+            if factor.kind != OBSERVATION:
+                continue
+            covariance = turn.T @ factor.covariance @ turn
+            if not agree:
+                covariance = covariance.copy()
+                covariance[:3], covariance[:, :3] = 0.0, 0.0
+                covariance[:3, :3] = LOOSE_ROTATION**2 * np.eye(3)
+            self.add(Factor(OBSERVATION, factor.a, b, factor.T @ T_a_b, covariance))
+        self.first_values.pop(landmark_key(a), None)
+
+    def steps_of(self, pose: int) -> tuple[int | None, int | None]:
+        """Numbers of the steps that lead to a pose and away from it."""
+        before = after = None
+        for number in self.of_pose[pose]:
+            factor = self.factors[number]
+            if factor.kind == STEP:
+                before, after = (number, after) if factor.b == pose else (before, number)
+        return before, after
+
+    def neighbour(self, pose: int) -> int | None:
+        """The pose the next step leads to."""
+        after = self.steps_of(pose)[1]
+        return None if after is None else self.factors[after].b
+
+    def condense(self, poses: list[int]) -> None:
+        """Let the middle one of consecutive poses stand for all of them.
+
+        It takes over their observations, fused in a solve of this stretch alone; the odometry between what remains is
+        composed. Observations become independent of one another given that pose, which they nearly are: what is lost is
+        tested. The others keep their place relative to it.
+        """
+        anchor = poses[len(poses) // 2]
+        numbers = sorted({n for p in poses for n in self.of_pose[p]})
+        inside = set(poses)
+        local = [f for f in (self.factors[n] for n in numbers) if f.kind == OBSERVATION or (f.kind == STEP and {f.a, f.b} <= inside)]
+        T_pose = {p: self.pose(p) for p in poses}
+        T_landmark = {f.b: self.landmark(f.b) for f in local if f.kind == OBSERVATION}
+        built = [f.build() for f in local]
+        fused = condensed_observations(built, T_pose, T_landmark, anchor)
+        for number in numbers:
+            if self.factors[number].kind == OBSERVATION:
+                self.remove(number)
+        for j, T, covariance in fused:
+            self.add(Factor(OBSERVATION, anchor, j, T, covariance))
+        for pose in poses:
+            if pose != anchor:
+                self._bridge(pose, anchor)
+
+    def drop(self, pose: int, onto: int) -> None:
+        """Forget the observations of a pose, and the pose; its place is kept relative to another one."""
+        for number in sorted(self.of_pose[pose]):
+            if self.factors[number].kind == OBSERVATION:
+                self.remove(number)
+        self._bridge(pose, onto)
+
+    def _bridge(self, pose: int, onto: int) -> None:
+        """Eliminate a pose that has steps alone: exact, but for its place, which is frozen relative to `onto`."""
+        T = inverse(self.pose(onto)) @ self.pose(pose)
+        before, after = self.steps_of(pose)
+        if before is not None and after is not None:
+            self.add(compose(self.factors[before], self.factors[after]))
+        for number in (before, after):
+            if number is not None:
+                self.remove(number)
+        for frame in self.carried.pop(pose, []):
+            self.attached[frame] = (onto, T @ self.attached[frame][1])
+            self.carried.setdefault(onto, []).append(frame)
+        self.attached[pose] = (onto, T)
+        self.carried.setdefault(onto, []).append(pose)
+
+    # -- solving ------------------------------------------------------------------------------------------------------
+
+    def commit(self, *, force: bool = False) -> gtsam.ISAM2Result:
+        """Hand what waits to iSAM2; `force` linearises anew whatever has moved enough.
 
         Raises:
             GraphError: GTSAM could not solve it; names the variable.
         """
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        needed: set[int] = set()
+        for number in self.added:
+            graph.add(self.factors[number].build())
+            needed.update(self.factors[number].keys())
+        for key, T in self.first_values.items():
+            if key in needed:
+                values.insert(key, gtsam.Pose3(T))
         try:
-            self.isam.update(self.graph, self.values)
+            result = self.isam.update(graph, values, self.removed, force_relinearize=force)
         except RuntimeError as error:
             raise named_error(error) from None
-        self.graph = gtsam.NonlinearFactorGraph()
-        self.values = gtsam.Values()
+        for number, slot in zip(self.added, result.getNewFactorsIndices()):
+            self.factors[number].slot = int(slot)
+        self.added, self.removed, self.first_values = [], [], {}
+        return result
+
+    def settle(self, repeats: int = 3) -> None:
+        """Solve again after the map has moved far."""
+        for _ in range(repeats):
+            if not self.commit(force=True).getVariablesRelinearized():
+                break
+
+    def rebuild(self) -> None:
+        """A new iSAM2 with the same factors, linearised where the estimate stands: what a file can hold and give back."""
+        self.commit()
+        values = self.isam.calculateEstimate()
+        poses = {key: values.atPose3(key).matrix() for key in values.keys()}
+        self.restart(poses)
+
+    def restart(self, values: dict[int, Float[np.ndarray, "4 4"]]) -> None:
+        """Put all factors into a new iSAM2 at the given values."""
+        self.isam = new_isam()
+        self.first_values = dict(values)
+        self.added = sorted(self.factors)
+        self.removed = []
+        for factor in self.factors.values():
+            factor.slot = -1
+        self.commit()
+
+    # -- answers ------------------------------------------------------------------------------------------------------
+
+    def _value(self, key: int) -> Float[np.ndarray, "4 4"]:
+        waiting = self.first_values.get(key)
+        return waiting if waiting is not None else self.isam.calculateEstimatePose3(key).matrix()
 
     def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
-        """Pose of a keyframe."""
-        return self.isam.calculateEstimatePose3(pose_key(frame)).matrix()
+        """Pose of a keyframe; its first value while it waits."""
+        if frame in self.attached:
+            onto, T = self.attached[frame]
+            return self._value(pose_key(onto)) @ T
+        return self._value(pose_key(frame))
 
     def landmark(self, number: int) -> Float[np.ndarray, "4 4"]:
         """Pose of a landmark; its first value while it waits."""
-        key = landmark_key(number)
-        if self.values.exists(key):
-            return self.values.atPose3(key).matrix()
-        return self.isam.calculateEstimatePose3(key).matrix()
+        return self._value(landmark_key(number))
+
+    def landmark_covariance(self, number: int) -> Float[np.ndarray, "6 6"]:
+        """Covariance of a landmark, [rotation rad, position m] in its own frame, the first pose held fixed."""
+        return np.asarray(self.isam.marginalCovariance(landmark_key(number)))
+
+    def pose_covariance(self, frame: int) -> Float[np.ndarray, "6 6"]:
+        """Covariance of a pose, [rotation rad, position m] in the camera's frame; that of the pose it hangs on, carried."""
+        if frame not in self.attached:
+            return np.asarray(self.isam.marginalCovariance(pose_key(frame)))
+        onto, T = self.attached[frame]
+        carry = adjoint(inverse(T))
+        return carry @ np.asarray(self.isam.marginalCovariance(pose_key(onto))) @ carry.T
 
     def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
         """All poses."""
         values = self.isam.calculateEstimate()
-        return np.array([values.atPose3(pose_key(i)).matrix() for i in range(self.poses)])
+        out = np.empty((self.poses, 4, 4))
+        for i in range(self.poses):
+            onto, T = self.attached.get(i, (i, None))
+            pose = values.atPose3(pose_key(onto)).matrix()
+            out[i] = pose if T is None else pose @ T
+        return out
+
+    def landmarks_of(self, poses: Iterable[int]) -> set[int]:
+        """Landmarks observed from the given poses."""
+        numbers = {n for p in poses for n in self.of_pose.get(p, ())}
+        return {self.factors[n].b for n in numbers if self.factors[n].kind == OBSERVATION}
+
+    def watchers(self, landmark: int) -> list[int]:
+        """Poses that observe a landmark, oldest first."""
+        return sorted({self.factors[n].a for n in self.of_landmark[landmark] if self.factors[n].kind == OBSERVATION})
+
+
+def new_isam() -> gtsam.ISAM2:
+    """iSAM2 as the running graph needs it."""
+    parameters = gtsam.ISAM2Params()
+    # Between-factors are linear in positions: only rotations that have moved need a new linearisation point.
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for symbol in "xl":
+        thresholds.insert((symbol, np.repeat([RELINEARISE_ROTATION, RELINEARISE_POSITION], 3)))
+    parameters.setRelinearizeThreshold(thresholds)
+    parameters.relinearizeSkip = 10
+    parameters.findUnusedFactorSlots = True
+    # Landmarks hang on weak priors beside a nearly fixed first pose: QR takes that spread, Cholesky does not.
+    parameters.setFactorization("QR")
+    return gtsam.ISAM2(parameters)

@@ -1,251 +1,305 @@
-"""Loop closing of the online system: a window of ended tracks matched to older ones near enough under the coarse drift graph."""
+"""Which landmarks of the running map are one: tracks that begin are put to landmarks met again, ended ones close loops.
+
+On known ground a new track is compared with the landmarks that the drift allows to be there; where the association is sure
+the landmark is used again and nothing new enters the graph. After drift a window of ended tracks is matched to older
+landmarks (a constellation first, then single ones that are sure), and what is found to be one becomes one landmark.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import skew
-from nolbo_ppl.inference.slam.clusters import join
 from nolbo_ppl.inference.slam.consistent_cliques import find_closing
-from nolbo_ppl.inference.slam.detection_features import FeaturePrior, correlated_variance
 from nolbo_ppl.inference.slam.em import link_arrays, soft_assignment
-from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
+from nolbo_ppl.inference.slam.graph import LOOSE_ROTATION, SlamEstimate
 from nolbo_ppl.inference.slam.incremental.drift_graph import DriftGraph
-from nolbo_ppl.inference.slam.incremental.incremental_graph import OnlineGraph
+from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
+from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, landmark_features
 from nolbo_ppl.inference.slam.loop_candidates import (
     POSITION_GATE,
+    Pairs,
     PosteriorSamples,
     TrackletFeatures,
     candidate_pairs,
-    log_population,
 )
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 from nolbo_ppl.inference.slam.slam_state import link_scale
 
 SURE = 0.9
-"""Soft links above this weight are closed online; the rest waits for the end."""
-LINK_INTERVAL = 40
-"""Keyframes between two solves for closed loops: links found sooner wait. Such a solve costs twenty keyframes."""
-POPULATION = 300
-"""Tracks the population of latents is taken from."""
+"""Associations above this weight are made online; the rest waits for more detections, or for the end."""
+SOLVE_INTERVAL = 10
+"""Keyframes between two solves for closed loops: what is found sooner waits."""
+LONGEST_WAIT = 50
+"""Keyframes an ended track waits for others to be matched together with."""
 
 
-@dataclass
-class Track:
-    """A track as the online system keeps it."""
+@dataclass(frozen=True)
+class Merge:
+    """Two landmarks found to be one."""
 
-    rows: list[int]
-    """Its detections."""
-    landmark: int
-    """Landmark in the graph, -1 while it is too short."""
-    latent: Float[np.ndarray, " d"]
-    """Fused latent."""
-    latent_variance: Float[np.ndarray, " d"]
-    """Its variance, as if the views were independent."""
-    category: int
-    """Category of the first detection."""
-    symmetry: int
-    """Its symmetry."""
-    oriented: bool
-    """Whether it is oriented."""
-    first: int
-    """First frame."""
-    last: int
-    """Last frame."""
+    a: int
+    """The newer one, which goes."""
+    b: int
+    """The older one."""
+    T_a_b: Float[np.ndarray, "4 4"]
+    """Turn between their axes, `L_b = L_a T_a_b`."""
+    agree: bool
+    """Whether their orientations do."""
 
 
 class LoopCloser:
-    """Tracks that are landmarks, the drift between them, and the links closed so far."""
+    """The running map, the drift between its parts, and what is about to be merged."""
 
-    def __init__(self, config: SlamConfig, prior: FeaturePrior) -> None:
-        self.config, self.prior = config, prior
+    def __init__(self, config: SlamConfig, running: RunningMap) -> None:
+        self.config, self.map = config, running
         self.drift = DriftGraph()
-        self.tracks: list[Track] = []
         self.fresh: list[int] = []
-        self.links: list[tuple[int, int]] = []
-        self.position = np.zeros((0, 3))
-        self.waiting: list[tuple[Links, list[tuple[int, int, np.ndarray, float]]]] = []
-        self.solved_at = -LINK_INTERVAL
+        self.waiting: list[Merge] = []
+        self.solved_at = -SOLVE_INTERVAL
 
-    def add(self, track: Track) -> None:
-        """A track that entered the graph as its next landmark."""
-        self.fresh.append(len(self.tracks))
-        self.tracks.append(track)
+    # -- landmarks met again ------------------------------------------------------------------------------------------
 
-    def close(self, frame: int, graph: OnlineGraph, noise: NoiseModel) -> int:
-        """Match the newest window of ended tracks once enough of them are new; returns the number of links found."""
-        if frame - self.solved_at >= LINK_INTERVAL and self.flush(graph):
-            self.solved_at = frame
-        ended = [j for j in self.fresh if frame - self.tracks[j].last > 1]
+    def meet(
+        self,
+        drafts: list[RunningLandmark],
+        poses: list[Float[np.ndarray, "4 4"]],
+        frame: int,
+        taken: set[int],
+        graph: IncrementalGraph,
+        noise: NoiseModel,
+    ) -> tuple[list[tuple[int, float]], list[float]]:
+        """Compare tracks that begin with the landmarks that may be there.
+
+        Args:
+            drafts: what the tracks gathered so far.
+            poses: their poses in the world frame of the graph.
+            frame: the keyframe.
+            taken: landmarks that belong to other live tracks.
+
+        Returns:
+            The likeliest landmark of each track (-1: none) with its probability, and the probability of each being new.
+        """
+        count = len(drafts)
+        if not len(self.map) or not count:
+            return [(-1, 0.0)] * count, [1.0] * count
+        rng = np.random.default_rng([self.config.seed, frame, 1])
+        error = self.drift.samples(self.config.samples, rng)
+        here = self.drift.samples_here(self.config.samples, rng)
+        floor = link_scale(noise)
+        near: set[int] = set()
+        for T in poses:
+            near.update(self._reachable(T[:3, 3], here, error, floor))
+        old = [j for j in sorted(near - taken) if self.map.landmarks[j].last < frame]
+        if not old:
+            return [(-1, 0.0)] * count, [1.0] * count
+        landmarks = [self.map.landmarks[j] for j in old]
+        for i, j in enumerate(old):
+            self._place(j, graph.landmark(j)[:3, 3])
+        T_all = np.array([graph.landmark(j) for j in old] + poses)
+        everyone = landmarks + drafts
+        fresh = np.arange(len(old), len(everyone))
+        features = landmark_features(
+            everyone, fresh, self.map.population(), self.config.latent_correlation or 0.0
+        )
+        errors = np.concatenate([error[self.drift.rows(np.array([j.place for j in landmarks]))], np.tile(here, (count, 1, 1))])
+        samples = landmark_samples(T_all, everyone, noise, errors, rng)
+        pairs = compare(T_all, samples, features, everyone, fresh, self.map, self.config, floor)
+        pairs = pairs.select(pairs.b < len(old))
+        best, new = [(-1, 0.0)] * count, [1.0] * count
+        if not len(pairs):
+            return best, new
+        # All begin in one frame, so they are different objects.
+        times = np.where(np.arange(len(everyone)) < len(old), frame + 1, frame)
+        features = replace(features, first=times, last=times)
+        a, b, weight, _ = soft_assignment(
+            pairs, features, np.arange(len(everyone)), float(np.log(noise.new_rate)), replace(self.config, link_minimum=1e-6)
+        )
+        for i, j, w in zip(a.tolist(), b.tolist(), weight.tolist()):
+            k = i - len(old)
+            new[k] -= w
+            if w > best[k][1]:
+                best[k] = (old[j], w)
+        return best, new
+
+    def met(self, landmark: int, position: Float[np.ndarray, " 3"], noise: NoiseModel) -> None:
+        """The camera is where this landmark is."""
+        self.drift.meet(self.map.landmarks[landmark].place, position, 2 * link_scale(noise))
+
+    def _place(self, number: int, position: Float[np.ndarray, " 3"]) -> None:
+        self.map.position[np.searchsorted(self.map.numbers, number)] = position
+
+    def _reachable(
+        self, centre: Float[np.ndarray, " 3"], here: Float[np.ndarray, "6 s"], error: Float[np.ndarray, "n 6 s"], floor: float
+    ) -> list[int]:
+        """Landmarks no farther from a point than the drift between them and the camera can explain."""
+        moved = error[:, 3:] - skew(centre) @ error[:, :3]
+        own = here[3:] - skew(centre) @ here[:3]
+        variance = np.mean(np.sum((moved - own) ** 2, axis=1), axis=1)
+        radius = np.sqrt(POSITION_GATE * (variance + 3 * (2 * floor) ** 2))
+        place = np.array([self.map.landmarks[j].place for j in self.map.numbers.tolist()])
+        return self.map.near(centre, radius[self.drift.rows(place)])
+
+    # -- loops --------------------------------------------------------------------------------------------------------
+
+    def add(self, landmark: RunningLandmark, position: Float[np.ndarray, " 3"]) -> None:
+        """A landmark new to the map."""
+        self.map.add(landmark, position)
+        self.fresh.append(landmark.number)
+
+    def close(self, frame: int, graph: IncrementalGraph, noise: NoiseModel, live: set[int]) -> int:
+        """Match the newest window of landmarks whose tracks have ended to older ones; returns the number of pairs found."""
+        if self.waiting and frame - self.solved_at >= SOLVE_INTERVAL:
+            self.flush(frame, graph)
+        self.fresh = [j for j in self.fresh if j in self.map.landmarks]
+        ended = [j for j in self.fresh if j not in live and frame - self.map.landmarks[j].last > 1]
         half = max(self.config.constellation_size // 2, 1)
-        if len(ended) < half:
+        if not ended or (len(ended) < half and frame - min(self.map.landmarks[j].last for j in ended) < LONGEST_WAIT):
             return 0
         taken = set(ended)
         self.fresh = [j for j in self.fresh if j not in taken]
-        window = np.unique([*ended, *range(max(min(ended) - half, 0), min(ended))])
-        rng = np.random.default_rng([self.config.seed, frame])
+        going = {merge.a for merge in self.waiting}
+        first = int(np.searchsorted(self.map.numbers, min(ended)))
+        window = sorted((taken | set(self.map.numbers[max(first - half, 0) : first].tolist())) - going)
+        window = window[-4 * half :]
+        rng = np.random.default_rng([self.config.seed, frame, 0])
         error = self.drift.samples(self.config.samples, rng)
-        self._look_up(graph, window)
-        near = np.union1d(window, self._near(window, error, link_scale(noise)))
-        poses = np.array([graph.landmark(j) for j in near.tolist()])
-        tracks = [self.tracks[j] for j in near.tolist()]
-        features = self._features(near, np.isin(near, window))
-        samples = track_samples(poses, tracks, noise, error[self.drift.node(middle_frames(tracks))], rng)
-        found = find_links(
-            np.flatnonzero(np.isin(near, window)),
-            SlamEstimate(np.zeros((0, 4, 4)), poses),
-            samples,
-            features,
-            tracks,
-            self.prior,
-            self.config,
-            self._links_among(near),
-            floor=link_scale(noise),
-            new_rate=noise.new_rate,
-        )
+        for j in window:
+            self._place(j, graph.landmark(j)[:3, 3])
+        floor = link_scale(noise)
+        near = sorted({*window, *self._near(window, error, floor)} - going)
+        landmarks = [self.map.landmarks[j] for j in near]
+        T = np.array([graph.landmark(j) for j in near])
+        fresh = np.flatnonzero(np.isin(near, window))
+        features = landmark_features(landmarks, fresh, self.map.population(), self.config.latent_correlation or 0.0)
+        places = self.drift.rows(np.array([j.place for j in landmarks]))
+        samples = landmark_samples(T, landmarks, noise, error[places], rng)
+        pairs = compare(T, samples, features, landmarks, fresh, self.map, self.config, floor)
+        found = find_merges(pairs, fresh, T, samples, features, self.config, floor=floor, new_rate=noise.new_rate)
         if found:
-            self._link(found, near, poses, features, link_scale(noise))
-            if frame - self.solved_at >= LINK_INTERVAL and self.flush(graph):
-                self.solved_at = frame
+            self._note(found, near, T, features, floor)
+            if frame - self.solved_at >= SOLVE_INTERVAL:
+                self.flush(frame, graph)
         return len(found)
 
-    def flush(self, graph: OnlineGraph) -> bool:
-        """Put the links that wait into the graph and solve; whether there were any."""
-        if not self.waiting:
-            return False
-        for links, ties in self.waiting:
-            graph.add_links(links)
-            for tie in ties:
-                self.drift.close(*tie)
-        graph.commit()
-        self.waiting = []
-        self.position = np.zeros((0, 3))  # the map has moved
-        return True
-
-    def _look_up(self, graph: OnlineGraph, window: Int[np.ndarray, " w"]) -> None:
-        """Positions of landmarks new since the last time, and of the window; all of them after a closing has moved the map."""
-        known = len(self.position)
-        self.position = np.concatenate([self.position, np.zeros((len(self.tracks) - known, 3))])
-        for j in {*range(known, len(self.tracks)), *window.tolist()}:
-            self.position[j] = graph.landmark(j)[:3, 3]
-
-    def _near(self, window: Int[np.ndarray, " w"], error: Float[np.ndarray, "n 6 s"], floor: float) -> Int[np.ndarray, " c"]:
-        """Landmarks no farther from the window than the drift between their nodes can explain."""
-        centre = self.position[window].mean(axis=0)
-        reach = np.linalg.norm(self.position[window] - centre, axis=1).max()
+    def _near(self, window: list[int], error: Float[np.ndarray, "n 6 s"], floor: float) -> list[int]:
+        """Landmarks no farther from the window than the drift between their places can explain."""
+        rows = np.searchsorted(self.map.numbers, window)
+        centre = self.map.position[rows].mean(axis=0)
+        reach = np.linalg.norm(self.map.position[rows] - centre, axis=1).max()
         moved = error[:, 3:] - skew(centre) @ error[:, :3]
-        here = int(self.drift.node(middle_frames([self.tracks[int(window[-1])]]))[0])
-        variance = np.mean(np.sum((moved - moved[here]) ** 2, axis=1), axis=1)
+        place = self.drift.rows(np.array([self.map.landmarks[j].place for j in self.map.numbers.tolist()]))
+        variance = np.mean(np.sum((moved - moved[place[rows[-1]]]) ** 2, axis=1), axis=1)
         # As wide as the gate of pairs, and half as much again: this drift is that of the window's centre.
         radius = 1.5 * np.sqrt(POSITION_GATE * (variance + 3 * floor**2)) + reach
-        node = self.drift.node(middle_frames(self.tracks))
-        return np.flatnonzero(np.linalg.norm(self.position - centre, axis=1) < radius[node])
+        return self.map.near(centre, radius[place])
 
-    def _features(self, near: Int[np.ndarray, " c"], inside: np.ndarray) -> TrackletFeatures:
-        """Features of the given landmarks, arranged so that only those inside can be the newer one of a pair.
-
-        How rare a latent is, is measured against tracks of the whole drive.
-        """
-        others = np.arange(0, len(self.tracks), max(1, len(self.tracks) // POPULATION))
-        everyone = np.concatenate([near, np.setdiff1d(others, near)])
-        latent = np.array([self.tracks[j].latent for j in everyone.tolist()])
-        views = np.array([len(self.tracks[j].rows) for j in everyone.tolist()], dtype=np.float64)
-        variance = correlated_variance(
-            np.array([self.tracks[j].latent_variance for j in everyone.tolist()]),
-            views,
-            self.config.latent_correlation or 0.0,
-        )
-        rarity = log_population(latent, variance, np.flatnonzero(inside))
-        tracks, count = [self.tracks[j] for j in near.tolist()], len(near)
-        first = np.array([t.first for t in tracks])
-        return TrackletFeatures(
-            latent=latent[:count],
-            latent_variance=variance[:count],
-            log_population=rarity[:count],
-            category=np.array([t.category for t in tracks]),
-            symmetry=np.array([t.symmetry for t in tracks]),
-            oriented=np.array([t.oriented for t in tracks]),
-            first=np.where(inside, first, -1),
-            last=np.array([t.last for t in tracks]),
-        )
-
-    def _links_among(self, near: Int[np.ndarray, " c"]) -> Int[np.ndarray, "l 2"]:
-        """Links with both ends among the given landmarks, in their numbering."""
-        number = {int(j): i for i, j in enumerate(near)}
-        inside = [(number[a], number[b]) for a, b in self.links if a in number and b in number]
-        return np.array(inside, dtype=np.int64).reshape(-1, 2)
-
-    def _link(
+    def _note(
         self,
         found: list[tuple[int, int]],
-        near: Int[np.ndarray, " c"],
-        poses: Float[np.ndarray, "c 4 4"],
+        near: list[int],
+        T: Float[np.ndarray, "c 4 4"],
         features: TrackletFeatures,
-        scale: float,
+        floor: float,
     ) -> None:
         pairs = np.array(found, dtype=np.int64)
-        links = link_arrays(poses[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), scale)
-        a, b = near[pairs[:, 0]], near[pairs[:, 1]]
-        middle = middle_frames(self.tracks)
-        ties = [(int(middle[i]), int(middle[j]), poses[row, :3, 3], 2 * scale) for i, j, row in zip(a, b, pairs[:, 1])]
-        self.waiting.append((Links(a, b, links.weight, links.T_a_b, links.scale), ties))
-        self.links += list(zip(a.tolist(), b.tolist()))
+        links = link_arrays(T[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), floor)
+        for k, (i, j) in enumerate(found):
+            both = features.oriented[i] and features.oriented[j] and features.symmetry[i] != 0 and features.symmetry[j] != 0
+            agree = not both or links.scale[k, 0] < LOOSE_ROTATION
+            self.waiting.append(Merge(near[i], near[j], links.T_a_b[k], bool(agree)))
+            a, b = self.map.landmarks[near[i]], self.map.landmarks[near[j]]
+            self.drift.close(a.place, b.place, T[j, :3, 3], 2 * floor)
+
+    def flush(self, frame: int, graph: IncrementalGraph) -> bool:
+        """Merge what waits and solve; whether anything was merged."""
+        oldest = None
+        for merge in self.waiting:
+            a, b = self.map.standing(merge.a), self.map.standing(merge.b)
+            if a == b or a != merge.a or self.map.landmarks[a].together_with(self.map.landmarks[b]):
+                continue
+            graph.merge(a, b, merge.T_a_b, agree=merge.agree)
+            self.map.merge(a, b)
+            oldest = a if oldest is None else min(oldest, a)
+        self.waiting = []
+        if oldest is None:
+            return False
+        self.solved_at = frame
+        graph.settle()
+        for k, j in enumerate(self.map.numbers.tolist()):
+            self.map.position[k] = graph.landmark(j)[:3, 3]
+        # The map has moved: what found no partner before may find one now.
+        again = self.map.numbers[self.map.numbers >= oldest - self.config.constellation_size].tolist()
+        self.fresh = sorted({*self.fresh, *again})
+        return True
 
 
-def middle_frames(tracks: list[Track]) -> Int[np.ndarray, " m"]:
-    """Frame in the middle of each track's life."""
-    return np.array([(t.first + t.last) // 2 for t in tracks], dtype=np.int64)
-
-
-def track_samples(
+def compare(
     T_world_landmark: Float[np.ndarray, "m 4 4"],
-    tracks: list[Track],
+    samples: PosteriorSamples,
+    features: TrackletFeatures,
+    landmarks: list[RunningLandmark],
+    fresh: Int[np.ndarray, " f"],
+    running: RunningMap,
+    config: SlamConfig,
+    floor: float,
+) -> Pairs:
+    """Candidate pairs of a fresh landmark and one before it in the list, never seen together."""
+    order = np.arange(len(landmarks))
+    spans = replace(features, first=np.where(np.isin(order, fresh), order, -1), last=order)
+    estimate = SlamEstimate(np.zeros((0, 4, 4)), T_world_landmark)
+    pairs = candidate_pairs(estimate, samples, spans, running.prior, config, inflation=1.0, floor=floor)
+    apart = [not landmarks[a].together_with(landmarks[b]) for a, b in zip(pairs.a.tolist(), pairs.b.tolist())]
+    return pairs.select(np.array(apart, dtype=bool))
+
+
+def landmark_samples(
+    T_world_landmark: Float[np.ndarray, "m 4 4"],
+    landmarks: list[RunningLandmark],
     noise: NoiseModel,
     error: Float[np.ndarray, "m 6 s"],
     rng: np.random.Generator,
 ) -> PosteriorSamples:
-    """Samples of landmarks: the drift of their nodes, and the noise of their own detections."""
+    """Samples of landmarks: the drift of their places, and the noise of their own detections."""
     moved = np.cross(error[:, :3], T_world_landmark[:, :3, 3, None], axis=1) + error[:, 3:]
     own, turn = 0.1, 0.1
     if len(noise.position_covariance):
         own = float(np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3))
         turn = float(np.median(noise.rotation_scale))
-    share = 1.0 / np.sqrt([len(t.rows) for t in tracks])[:, None, None]
+    share = 1.0 / np.sqrt([max(j.views, 1) for j in landmarks])[:, None, None]
     return PosteriorSamples(
         moved + own * share * rng.standard_normal(moved.shape), error[:, :3] + turn * share * rng.standard_normal(moved.shape)
     )
 
 
-def find_links(
-    window: Int[np.ndarray, " w"],
-    estimate: SlamEstimate,
+def find_merges(
+    pairs: Pairs,
+    fresh: Int[np.ndarray, " f"],
+    T_world_landmark: Float[np.ndarray, "m 4 4"],
     samples: PosteriorSamples,
     features: TrackletFeatures,
-    tracks: list[Track],
-    prior: FeaturePrior,
     config: SlamConfig,
-    links: Int[np.ndarray, "l 2"],
     *,
     floor: float,
     new_rate: float,
 ) -> list[tuple[int, int]]:
-    """Links of the window's tracks: a constellation when one passes, then single ones that are sure."""
-    pairs = candidate_pairs(estimate, samples, features, prior, config, inflation=1.0, floor=floor)
-    pairs = pairs.select(~np.isin(pairs.a, links[:, 0]))
-    outside = pairs.select(~np.isin(pairs.b, window))
+    """Fresh landmarks that are older ones: a constellation when one passes, then single ones that are sure."""
+    estimate = SlamEstimate(np.zeros((0, 4, 4)), T_world_landmark)
+    outside = pairs.select(~np.isin(pairs.b, fresh))
     closing = find_closing(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=float(np.log(5.0 * new_rate)))
     found: list[tuple[int, int]] = []
     least = config.constellation_log_odds
     if closing and closing.log_odds > least and closing.margin > least / 2:
         found += list(zip(closing.a.tolist(), closing.b.tolist()))
-    rest = pairs.select(~np.isin(pairs.a, [a for a, _ in found]))
+    used = [i for pair in found for i in pair]
+    rest = pairs.select(~np.isin(pairs.a, used) & ~np.isin(pairs.b, used))
     if len(rest):
-        frames = [frozenset(range(t.first, t.last + 1)) for t in tracks]
-        closed = Links(links[:, 0], links[:, 1], np.ones(len(links)), np.zeros((0, 4, 4)), np.zeros((0, 2)))
-        cluster = join(closed, frames, config.merge_weight)
-        a, b, weight, _ = soft_assignment(rest, features, cluster, float(np.log(new_rate)), config)
-        found += [(int(i), int(j)) for i, j, w in zip(a, b, weight) if w > SURE]
+        a, b, weight, _ = soft_assignment(rest, features, np.arange(len(features.first)), float(np.log(new_rate)), config)
+        for k in np.argsort(-weight, kind="stable"):
+            if weight[k] > SURE and int(a[k]) not in used and int(b[k]) not in used:
+                found.append((int(a[k]), int(b[k])))
+                used += found[-1]
     return found

@@ -1,13 +1,15 @@
-"""Online SLAM: a keyframe at a time on iSAM2, loops closed as tracks end, the batch map at the end.
+"""Online SLAM: a keyframe at a time on iSAM2, landmarks used again where they are met again, the batch map at the end.
 
-Each keyframe costs one association of its detections with live tracks, one iSAM2 update, and the read-out of one pose. Every
-few ended tracks one window of them is matched to all older ones (constellation first, the soft E-step for the rest) under the
-covariance of a coarse drift graph. `finish` hands tracks and closings to the batch EM for the final map.
+Each keyframe costs one association of its detections with live tracks, one of new tracks with landmarks that may be there, one
+iSAM2 update, and the read-out of one pose. On known ground nothing is added to the map, and keyframes behind the window are
+condensed (`KeyframeConfig`), so that the running graph follows the ground covered and not the time driven. Every few ended
+tracks that found no landmark one window of them is matched to all older ones, and what is one object becomes one landmark.
+`landmarks()` and `trajectory()` answer at any keyframe; `finish` hands all tracks to the batch EM for the final map.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,17 +17,24 @@ from jaxtyping import Float
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
-from nolbo_ppl.inference.slam.detection_features import fit_prior, fuse_latent
-from nolbo_ppl.inference.slam.incremental.incremental_graph import OnlineGraph
-from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser, Track
+from nolbo_ppl.inference.slam.detection_features import detection_features, fit_prior
+from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
+from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE, LoopCloser
+from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
+from nolbo_ppl.inference.slam.incremental.map_answers import map_landmarks
+from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, new_landmark
 from nolbo_ppl.inference.slam.initialise import init, init_from_tracklets
-from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
+from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.tracking import Tracker, summarise_tracks
 from nolbo_ppl.io.observations import Detections, concatenate
+from nolbo_ppl.structures.landmark import Landmark
+
+MOST_WAIT = 5
+"""Detections a track gathers at most before it founds a landmark, where a known one may be there but is not sure."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +46,27 @@ class OnlineInfo:
     T_world_camera: Float[np.ndarray, "4 4"]
     """Current pose."""
     landmarks: int
-    """Landmarks in the graph."""
+    """Landmarks in the running graph."""
     closings: int
-    """Links closed at this keyframe."""
+    """Pairs of landmarks found to be one at this keyframe."""
+    met: int = 0
+    """Tracks put to landmarks met again at this keyframe."""
+    keyframes: int = 0
+    """Poses in the running graph."""
+
+
+@dataclass
+class LiveTrack:
+    """A track the tracker still follows."""
+
+    landmark: int
+    """Its landmark, -1 while it has none."""
+    draft: RunningLandmark
+    """What it gathered until then."""
+    waiting: list[tuple[int, SlamProblem, NoiseModel, int]] = field(default_factory=list)
+    """Detections that wait for a landmark: keyframe, its problem and scales, and the row."""
+    last: int = 0
+    """Newest frame."""
 
 
 class IncrementalSlam:
@@ -49,23 +76,28 @@ class IncrementalSlam:
     earlier one of the same sensors) given as `calibration`; without one they are the defaults.
     """
 
-    def __init__(self, config: SlamConfig | None = None, calibration: SlamProblem | None = None) -> None:
+    def __init__(
+        self,
+        config: SlamConfig | None = None,
+        calibration: SlamProblem | None = None,
+        keyframes: KeyframeConfig | None = None,
+    ) -> None:
         self.config = config or SlamConfig()
         self.calibration = calibration
-        self.reference: NoiseModel | None = None
+        self.keyframes = keyframes or KeyframeConfig()
         self.tracker: Tracker | None = None
+        self.frames = 0
+        self.last_odometry = np.eye(4)
         self.odometry: list[np.ndarray] = []
         self.tables: list[Detections] = []
-        self.frame_of: list[int] = []
         self.assigned: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
-        self.tracks: dict[int, Track] = {}
-        self.loops: LoopCloser | None = None
-        self.pending: dict[int, list[tuple[int, Measurements, NoiseModel, int]]] = {}
-        self.graph = OnlineGraph()
         self.step_covariances: list[np.ndarray] = []
+        self.stated: bool | None = None
+        self.tracks: dict[int, LiveTrack] = {}
+        self.graph = IncrementalGraph()
+        self.keeper = KeyframeKeeper(self.keyframes)
         self.T_world_camera = np.eye(4)
-        self.seen = 0
 
     # -- one keyframe -------------------------------------------------------------------------------------------------
 
@@ -88,31 +120,34 @@ class IncrementalSlam:
         odometry = np.asarray(odometry, dtype=np.float64)
         if odometry.shape != (4, 4) or not np.isfinite(odometry).all() or not is_rotation(odometry[:3, :3]):
             raise input_error("odometry is no pose", got=odometry, expected="a finite 4 x 4 rigid motion")
-        frame = len(self.odometry)
+        frame = self.frames
         if frame and odometry_covariance is not None:
             check_step_covariance(np.asarray(odometry_covariance)[None], 1)
-        if frame > 1 and (odometry_covariance is None) == bool(self.step_covariances):
+        if frame > 1 and (odometry_covariance is not None) != self.stated:
             raise input_error("odometry_covariance is given for some keyframes only", do="give it for all or for none")
         table = replace(observations, frame=np.zeros(len(observations), dtype=np.int64))
         problem = SlamProblem(odometry[None], table)  # checks the detections
         self._begin(table)
         noise = self._noise(problem)
         rotation, translation = self._add_pose(odometry, frame, odometry_covariance)
-        measurements = resolve(table, noise, self.config, self.prior)
-        assigned, weight = self._track(measurements, odometry, frame, rotation, translation)
-        start = self.seen
-        self.odometry.append(odometry)
-        self.tables.append(replace(table, frame=np.full(len(table), frame, dtype=np.int64)))
-        self.assigned.append(assigned)
-        self.weights.append(weight)
-        self.seen += len(table)
-        self._remember(measurements, assigned, start, frame)
-        self._add_factors(problem, measurements, noise, assigned, frame)
+        assigned, weight = self._track(table, noise, odometry, frame, rotation, translation)
+        self.frames += 1
+        self.last_odometry = odometry
+        if self.keyframes.history:
+            self.odometry.append(odometry)
+            self.tables.append(replace(table, frame=np.full(len(table), frame, dtype=np.int64)))
+            self.assigned.append(assigned)
+            self.weights.append(weight)
+        met = self._map(problem, noise, assigned, frame)
+        self.keeper.advance(frame, self.graph)
         self.graph.commit()
-        assert self.loops is not None
-        closings = self.loops.close(frame, self.graph, noise)
+        closings = self.loops.close(frame, self.graph, noise, self._live())
         self.T_world_camera = self.graph.pose(frame)
-        return OnlineInfo(frame, self.T_world_camera, self.graph.landmarks, closings)
+        return OnlineInfo(frame, self.T_world_camera, len(self.loops.map), closings, met, len(self.graph.of_pose))
+
+    def _live(self) -> set[int]:
+        """Landmarks that belong to live tracks."""
+        return {self.loops.map.standing(t.landmark) for t in self.tracks.values() if t.landmark >= 0}
 
     def _begin(self, table: Detections) -> None:
         """At the first keyframe: scales of the reference, and the prior of features."""
@@ -157,7 +192,7 @@ class IncrementalSlam:
             self.config = replace(
                 self.config, new_rate=self.config.new_rate or rate, clutter_rate=self.config.clutter_rate or 0.5 * rate
             )
-        self.loops = LoopCloser(self.config, self.prior)
+        self.loops = LoopCloser(self.config, RunningMap(self.prior))
         self.tracker = Tracker(
             self.config,
             table.latent_dim,
@@ -176,15 +211,15 @@ class IncrementalSlam:
             self.T_world_camera = odometry
             self.graph.add_first_pose(odometry)
             return 0.0, 0.0
-        step = inverse(self.odometry[-1]) @ odometry
+        step = inverse(self.last_odometry) @ odometry
+        self.stated = covariance is not None
         if covariance is None:
             covariance = self._step_covariance(float(np.linalg.norm(step[:3, 3])))
-        else:
+        elif self.keyframes.history:
             self.step_covariances.append(np.asarray(covariance, dtype=np.float64))
         self.T_world_camera = self.T_world_camera @ step
         self.graph.add_pose(step, covariance, self.T_world_camera)
         rotation, translation = (float(np.sqrt(np.trace(covariance[part, part]) / 3)) for part in (slice(3), slice(3, 6)))
-        assert self.loops is not None
         self.loops.drift.advance(self.T_world_camera, rotation, translation)
         return rotation, translation
 
@@ -200,7 +235,8 @@ class IncrementalSlam:
 
     def _track(
         self,
-        measurements: Measurements,
+        table: Detections,
+        noise: NoiseModel,
         odometry: np.ndarray,
         frame: int,
         rotation: float,
@@ -210,91 +246,150 @@ class IncrementalSlam:
         assert tracker is not None
         if frame:
             tracker.predict(odometry, frame, rotation, translation)
-        if not len(measurements):
+        if not len(table):
             return np.zeros(0, dtype=np.int64), np.zeros(0)
-        return tracker.associate(measurements.in_world(np.tile(odometry, (len(measurements), 1, 1))), frame)
+        R = odometry[:3, :3]
+        latent, variance, category = detection_features(table, noise, self.prior)
+        return tracker.associate(
+            transform(odometry, table.position),
+            R @ noise.position_covariance @ R.T,
+            observed_modes(table, noise.rotation_scale).turned(R),
+            table.has_rotation,
+            resolved_symmetry(table, self.config),
+            latent,
+            variance,
+            category,
+            np.clip(table.objectness, *self.config.objectness_limits),
+            frame,
+        )
 
-    def _remember(
-        self,
-        measurements: Measurements,
-        assigned: np.ndarray,
-        start: int,
-        frame: int,
-    ) -> None:
-        """Fuse features of each detection into its track."""
-        latent, variance = measurements.latent, measurements.latent_variance
+    def _map(self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int) -> int:
+        """Put this keyframe's detections to landmarks; returns how many tracks met an old one.
+
+        A track asks for its landmark with its second detection (`track_minimum`), or later where it is not sure.
+        """
+        table = problem.observations
+        latent, variance, category = detection_features(table, noise, self.prior)
+        symmetry, oriented = resolved_symmetry(table, self.config), table.has_rotation
+        asking: list[tuple[int, int]] = []
         for i, number in enumerate(assigned.tolist()):
             if number < 0:
                 continue
             if number not in self.tracks:
-                self.tracks[number] = Track(
-                    [start + i],
-                    -1,
-                    latent[i],
-                    variance[i],
-                    int(measurements.category[i]),
-                    int(measurements.symmetry[i]),
-                    bool(measurements.oriented[i]),
-                    frame,
-                    frame,
-                )
-                continue
+                draft = new_landmark(-1, self.loops.drift.place, frame, self.prior, int(symmetry[i]))
+                self.tracks[number] = LiveTrack(-1, draft)
             track = self.tracks[number]
-            track.rows.append(start + i)
             track.last = frame
-            track.latent, track.latent_variance = fuse_latent(track.latent, track.latent_variance, latent[i], variance[i])
-
-    def _add_factors(
-        self, problem: SlamProblem, measurements: Measurements, noise: NoiseModel, assigned: np.ndarray, frame: int
-    ) -> None:
-        """Factors of this keyframe's detections; a track enters the graph with its second one, the first is then added."""
+            if track.landmark < 0:
+                track.draft.add(frame, latent[i], variance[i], int(category[i]), table.size[i], bool(oriented[i]))
+                track.waiting.append((frame, problem, noise, i))
+                if len(track.waiting) >= self.config.track_minimum:
+                    asking.append((number, i))
+        met = self._ask(asking, table, noise, frame)
         rows, landmarks = [], []
         for i, number in enumerate(assigned.tolist()):
-            if number < 0:
+            if number < 0 or self.tracks[number].landmark < 0:
                 continue
             track = self.tracks[number]
-            if track.landmark < 0 and len(track.rows) < self.config.track_minimum:
-                self.pending.setdefault(number, []).append((frame, measurements, noise, i))
-                continue
-            if track.landmark < 0:
-                self._found(track, problem.observations, i)
-                for earlier, its_measurements, its_noise, k in self.pending.pop(number, []):
-                    pose = self.graph.pose(earlier)
-                    self.graph.observe(its_measurements, its_noise, self.config, [k], earlier, pose, [track.landmark])
+            track.landmark = self.loops.map.standing(track.landmark)
+            for earlier, its_problem, its_noise, k in track.waiting[:-1]:
+                pose = self.graph.pose(earlier)
+                self.graph.observe(its_problem, its_noise, self.config, [k], earlier, pose, [track.landmark])
+                self._account(its_problem.observations, its_noise, [k], pose, [track.landmark])
+            if not track.waiting:
+                landmark = self.loops.map.landmarks[track.landmark]
+                landmark.add(frame, latent[i], variance[i], int(category[i]), table.size[i], bool(oriented[i]))
+            track.waiting = []
             rows.append(i)
             landmarks.append(track.landmark)
-        self.graph.observe(measurements, noise, self.config, rows, frame, self.T_world_camera, landmarks)
-        for number in [n for n in self.pending if frame - self.tracks[n].last > self.config.track_gap]:
-            del self.pending[number]
+        self.graph.observe(problem, noise, self.config, rows, frame, self.T_world_camera, landmarks)
+        self._account(table, noise, rows, self.T_world_camera, landmarks)
+        self.keeper.saw(frame, [self.loops.map.landmarks[j].passes > 1 for j in landmarks])
+        for number in [n for n, track in self.tracks.items() if frame - track.last > self.config.track_gap]:
+            del self.tracks[number]
+        return met
 
-    def _found(self, track: Track, table: Detections, i: int) -> None:
-        """A new landmark at its latest detection, with its weak prior."""
-        R = self.T_world_camera[:3, :3] @ table.rotation[i] if np.isfinite(table.rotation[i, 0, 0]) else np.eye(3)
-        T = make_pose(R, transform(self.T_world_camera, table.position[i]))
-        track.landmark = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])))
-        assert self.loops is not None
-        self.loops.add(track)
+    def _ask(self, asking: list[tuple[int, int]], table: Detections, noise: NoiseModel, frame: int) -> int:
+        """Give tracks their landmarks: one met again where that is sure, else a new one; the unsure may wait."""
+        if not asking:
+            return 0
+        tracks = [self.tracks[number] for number, _ in asking]
+        poses = [self._pose_of(table, i) for _, i in asking]
+        found, new = self.loops.meet([t.draft for t in tracks], poses, frame, self._live(), self.graph, noise)
+        met = 0
+        for track, T, (landmark, weight), alone, (_, i) in zip(tracks, poses, found, new, asking):
+            if weight > SURE:
+                old = self.loops.map.landmarks[landmark]
+                track.landmark = landmark
+                old.absorb(track.draft)
+                self.loops.met(landmark, T[:3, 3], noise)
+                met += 1
+            elif alone > SURE or len(track.waiting) >= MOST_WAIT:
+                number = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])))
+                track.landmark = track.draft.number = number
+                track.draft.place = self.loops.drift.place
+                self.loops.add(track.draft, T[:3, 3])
+        return met
+
+    def _pose_of(self, table: Detections, i: int) -> Float[np.ndarray, "4 4"]:
+        """First value of a landmark: its latest detection."""
+        R = self.T_world_camera[:3, :3] @ table.rotation[i] if table.has_rotation[i] else np.eye(3)
+        return make_pose(R, transform(self.T_world_camera, table.position[i]))
+
+    def _account(
+        self, table: Detections, noise: NoiseModel, rows: list[int], T_world_camera: np.ndarray, landmarks: list[int]
+    ) -> None:
+        """Evidence of each detection that its landmark is an object (see `map_answers`)."""
+        for i, j in zip(rows, landmarks):
+            landmark = self.loops.map.landmarks[j]
+            error = transform(inverse(T_world_camera), self.graph.landmark(j)[:3, 3]) - table.position[i]
+            landmark.count(
+                error,
+                T_world_camera[:3, :3],
+                noise.position_covariance[i],
+                float(np.clip(table.objectness[i], *self.config.objectness_limits)),
+                noise,
+            )
 
     # -- answers ------------------------------------------------------------------------------------------------------
 
     def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
-        """All poses as iSAM2 has them now, every loop found so far closed."""
-        if self.loops is not None:
-            self.loops.flush(self.graph)
+        """All poses as iSAM2 has them now, every loop found so far closed.
+
+        Raises:
+            InputError: no keyframe was given.
+        """
+        self._started()
+        self.loops.flush(self.frames - 1, self.graph)
         return self.graph.trajectory()
+
+    def landmarks(self) -> tuple[Landmark, ...]:
+        """The map as it is now: pose with covariance, existence, class, latent and size of every landmark.
+
+        Raises:
+            InputError: no keyframe was given.
+        """
+        self._started()
+        self.loops.flush(self.frames - 1, self.graph)
+        return map_landmarks(self.loops.map, self.graph, self.config)
+
+    def _started(self) -> None:
+        if not self.frames:
+            raise input_error("no keyframe was given", do="call update first")
 
     def finish(self) -> SlamResult:
         """Batch EM on the tracks gathered: the final trajectory and map.
 
         Raises:
-            InputError: no keyframe was given.
+            InputError: no keyframe was given, or the history was not kept.
         """
-        if not self.odometry:
-            raise input_error("no keyframe was given", do="call update first")
+        self._started()
+        if not self.keyframes.history:
+            raise input_error("the history was not kept", do="use trajectory() and landmarks(), or KeyframeConfig(history=True)")
         covariance = np.array(self.step_covariances) if self.step_covariances else None
         problem = SlamProblem(np.array(self.odometry), concatenate(self.tables), covariance)
         noise = estimate_noise(problem, self.config)
-        prior = fit_prior(problem.observations, self.config, noise)
+        prior = fit_prior(problem.observations, self.config)
         tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
         state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
         return complete(state)

@@ -1,0 +1,83 @@
+"""Which keyframes the running graph keeps: all of new ground, one of every few on known ground, and not without end.
+
+Keyframes behind the window in which mapped landmarks were met again are condensed, ten to one (`IncrementalGraph.condense`).
+A place driven past many times keeps its newest passes; what older ones said of the landmarks is then forgotten, which leaves
+the map a little less certain than it could be, never more. Those that first explored a place are always kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """How many keyframes the online system keeps in its graph."""
+
+    window: int = 20
+    """Newest keyframes, always kept."""
+    stretch: int = 10
+    """Keyframes of known ground that become one."""
+    least_met: int = 3
+    """Landmarks met again in a stretch that make it known ground."""
+    passes: int = 8
+    """Condensed keyframes from which one landmark is seen; beyond that the oldest go."""
+    history: bool = True
+    """Keep all detections for `finish`. Without, memory grows with the ground covered alone."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("window", 10), ("stretch", 1), ("least_met", 1), ("passes", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise input_error(name, got=value, expected=f"a whole number from {least}")
+
+
+class KeyframeKeeper:
+    """Condenses known ground behind the window, and forgets the oldest passes of a place."""
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self.config = config
+        self.stretch: list[int] = []
+        self.known: dict[int, int] = {}
+        self.condensed: list[int] = []
+
+    def saw(self, frame: int, met: list[bool]) -> None:
+        """Note how many landmarks met again a keyframe sees."""
+        self.known[frame] = sum(met)
+
+    def advance(self, frame: int, graph: IncrementalGraph) -> None:
+        """One more keyframe: what leaves the window may be condensed."""
+        leaving = frame - self.config.window
+        if leaving < 1:
+            return
+        self.stretch.append(leaving)
+        if len(self.stretch) < self.config.stretch:
+            return
+        stretch, self.stretch = self.stretch, []
+        seen = [self.known.pop(t, 0) for t in stretch]
+        if sum(1 for s in seen if s) < self.config.least_met or sum(seen) < self.config.least_met * 2:
+            return
+        graph.condense(stretch)
+        anchor = stretch[len(stretch) // 2]
+        self.condensed.append(anchor)
+        self._forget(anchor, graph)
+
+    def _forget(self, newest: int, graph: IncrementalGraph) -> None:
+        """While the landmarks seen from the newest anchor have too many of them, the oldest goes."""
+        own = set(self.condensed)
+        for j in sorted(graph.landmarks_of([newest])):
+            watchers = [i for i in graph.watchers(j) if i in own]
+            if len(watchers) <= self.config.passes:
+                continue
+            oldest = watchers[0]
+            onto = graph.neighbour(oldest)
+            if onto is None or oldest == newest:
+                continue
+            graph.drop(oldest, onto)
+            self.condensed.remove(oldest)
+            own.discard(oldest)
