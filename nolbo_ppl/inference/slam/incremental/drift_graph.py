@@ -23,6 +23,9 @@ from nolbo_ppl.geometry.pose import adjoint, skew
 MOST_NODES = 256
 """Nodes beyond which every second one goes."""
 
+TELLING = 4.0
+"""A landmark met again closes a loop when the drift it removes has this many times the variance it is met with."""
+
 
 @dataclass
 class DriftGraph:
@@ -78,13 +81,17 @@ class DriftGraph:
         node = self.standing[place]
         H = np.concatenate([-skew(position), np.eye(3)], axis=1)
         apart = self._between(self.here, node)
+        drift = H @ apart @ H.T
+        if np.trace(drift) > 3 * TELLING * scale**2:
+            self.close(self.place, place, position, float(np.sqrt(scale**2 + np.trace(H @ self.local @ H.T) / 3)))
         if self.steps - self.moved_at >= self.stride and node != self.here:
             self.here, self.place, self.local, apart = node, place, self.local + apart, np.zeros((6, 6))
             self.moved_at = self.steps
-        S = H @ (self.local + apart) @ H.T + scale**2 * np.eye(3)
+        drift = H @ apart @ H.T
+        S = H @ self.local @ H.T + drift + scale**2 * np.eye(3)
         gain = np.linalg.solve(S, H @ self.local).T
         left = np.eye(6) - gain @ H
-        self.local = left @ self.local @ left.T + gain @ (scale**2 * np.eye(3) + H @ apart @ H.T) @ gain.T
+        self.local = left @ self.local @ left.T + gain @ (scale**2 * np.eye(3) + drift) @ gain.T
         self.since = 0
 
     def _between(self, a: int, b: int) -> Float[np.ndarray, "6 6"]:

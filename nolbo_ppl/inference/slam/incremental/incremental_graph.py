@@ -159,13 +159,14 @@ class IncrementalGraph:
         frame: int,
         T_world_camera: Float[np.ndarray, "4 4"],
         landmarks: list[int],
-    ) -> None:
-        """Factors of detections of one keyframe (`problem` holds that keyframe alone)."""
+    ) -> Float[np.ndarray, "k 4 4"]:
+        """Factors of detections of one keyframe (`problem` holds that keyframe alone); returns where the landmarks stand."""
         if not rows:
-            return
+            return np.zeros((0, 4, 4))
         estimate = SlamEstimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
         found = resolve_observations(problem, noise, config, estimate, np.array(rows), np.arange(len(rows)), np.ones(len(rows)))
         self._add_observations(found, frame, landmarks)
+        return estimate.T_world_landmark
 
     def _add_observations(self, found: ObservationFactors, frame: int, landmarks: list[int]) -> None:
         for k in np.flatnonzero(found.weight > LEAST_WEIGHT):

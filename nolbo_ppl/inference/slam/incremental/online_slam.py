@@ -22,7 +22,7 @@ from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGr
 from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE, LoopCloser
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
 from nolbo_ppl.inference.slam.incremental.map_answers import map_landmarks
-from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, new_landmark
+from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, count_detections, new_landmark
 from nolbo_ppl.inference.slam.initialise import init, init_from_tracklets
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
 from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry
@@ -294,16 +294,16 @@ class IncrementalSlam:
             track.landmark = self.loops.map.standing(track.landmark)
             for earlier, its_problem, its_noise, k in track.waiting[:-1]:
                 pose = self.graph.pose(earlier)
-                self.graph.observe(its_problem, its_noise, self.config, [k], earlier, pose, [track.landmark])
-                self._account(its_problem.observations, its_noise, [k], pose, [track.landmark])
+                T = self.graph.observe(its_problem, its_noise, self.config, [k], earlier, pose, [track.landmark])
+                self._account(its_problem.observations, its_noise, [k], pose, [track.landmark], T)
             if not track.waiting:
                 landmark = self.loops.map.landmarks[track.landmark]
                 landmark.add(frame, latent[i], variance[i], int(category[i]), table.size[i], bool(oriented[i]))
             track.waiting = []
             rows.append(i)
             landmarks.append(track.landmark)
-        self.graph.observe(problem, noise, self.config, rows, frame, self.T_world_camera, landmarks)
-        self._account(table, noise, rows, self.T_world_camera, landmarks)
+        T = self.graph.observe(problem, noise, self.config, rows, frame, self.T_world_camera, landmarks)
+        self._account(table, noise, rows, self.T_world_camera, landmarks, T)
         self.keeper.saw(frame, [self.loops.map.landmarks[j].passes > 1 for j in landmarks])
         for number in [n for n, track in self.tracks.items() if frame - track.last > self.config.track_gap]:
             del self.tracks[number]
@@ -337,19 +337,27 @@ class IncrementalSlam:
         return make_pose(R, transform(self.T_world_camera, table.position[i]))
 
     def _account(
-        self, table: Detections, noise: NoiseModel, rows: list[int], T_world_camera: np.ndarray, landmarks: list[int]
+        self,
+        table: Detections,
+        noise: NoiseModel,
+        rows: list[int],
+        T_world_camera: Float[np.ndarray, "4 4"],
+        landmarks: list[int],
+        T_world_landmark: Float[np.ndarray, "k 4 4"],
     ) -> None:
-        """Evidence of each detection that its landmark is an object (see `map_answers`)."""
-        for i, j in zip(rows, landmarks):
-            landmark = self.loops.map.landmarks[j]
-            error = transform(inverse(T_world_camera), self.graph.landmark(j)[:3, 3]) - table.position[i]
-            landmark.count(
-                error,
-                T_world_camera[:3, :3],
-                noise.position_covariance[i],
-                float(np.clip(table.objectness[i], *self.config.objectness_limits)),
-                noise,
-            )
+        """Evidence of each detection that its landmark is an object (see `existence`)."""
+        if not rows:
+            return
+        error = transform(inverse(T_world_camera), T_world_landmark[:, :3, 3]) - table.position[rows]
+        objectness = np.clip(table.objectness[rows], *self.config.objectness_limits)
+        count_detections(
+            [self.loops.map.landmarks[j] for j in landmarks],
+            error,
+            T_world_camera[:3, :3],
+            noise.position_covariance[rows],
+            objectness,
+            noise,
+        )
 
     # -- answers ------------------------------------------------------------------------------------------------------
 

@@ -85,32 +85,6 @@ class RunningLandmark:
             self.size = self.size + size
             self.sizes += 1
 
-    def count(
-        self,
-        error: Float[np.ndarray, " 3"],
-        R_world_camera: Float[np.ndarray, "3 3"],
-        covariance: Float[np.ndarray, "3 3"],
-        objectness: float,
-        noise: NoiseModel,
-    ) -> None:
-        """Evidence of one detection that this is an object rather than background (see `map_answers`).
-
-        Args:
-            error: position predicted less observed, in the camera frame, m.
-            covariance: of the observed position in the camera frame, m^2.
-            objectness: its probability of being an object.
-            noise: the rates.
-        """
-        ratio = np.log(objectness) - np.log1p(-objectness) - np.log(noise.clutter_rate)
-        if not self.information.any():
-            self.log_odds += ratio + np.log(noise.new_rate)
-        else:
-            spread = np.linalg.inv(self.information) + link_scale(noise) ** 2 * np.eye(3)
-            S = covariance + R_world_camera.T @ spread @ R_world_camera
-            value = ratio + float(log_normal(error, S))
-            self.log_odds += float(np.logaddexp(np.log1p(-RIGHT_TRACK), np.log(RIGHT_TRACK) + value))
-        self.information = self.information + R_world_camera @ np.linalg.inv(covariance) @ R_world_camera.T
-
     def absorb(self, other: RunningLandmark) -> None:
         """Take over the detections of another landmark that is the same object."""
         self.latent, self.latent_variance = fuse_latent(
@@ -150,6 +124,36 @@ def new_landmark(number: int, place: int, frame: int, prior: FeaturePrior, symme
         symmetry=symmetry,
         votes=np.zeros(len(prior.categories)),
     )
+
+
+def count_detections(
+    landmarks: list[RunningLandmark],
+    error: Float[np.ndarray, "k 3"],
+    R_world_camera: Float[np.ndarray, "3 3"],
+    covariance: Float[np.ndarray, "k 3 3"],
+    objectness: Float[np.ndarray, " k"],
+    noise: NoiseModel,
+) -> None:
+    """Evidence of detections of one keyframe that their landmarks are objects rather than background (see `map_answers`).
+
+    Args:
+        landmarks: the landmark of each detection.
+        error: position predicted less observed, in the camera frame, m.
+        covariance: of the observed positions in the camera frame, m^2.
+        objectness: probability of each detection being an object.
+        noise: the rates.
+    """
+    ratio = np.log(objectness) - np.log1p(-objectness) - np.log(noise.clutter_rate)
+    information = np.array([j.information for j in landmarks])
+    known = information.any(axis=(1, 2))
+    spread = np.linalg.inv(np.where(known[:, None, None], information, np.eye(3))) + link_scale(noise) ** 2 * np.eye(3)
+    value = ratio + log_normal(error, covariance + R_world_camera.T @ spread @ R_world_camera)
+    value = np.logaddexp(np.log1p(-RIGHT_TRACK), np.log(RIGHT_TRACK) + value)
+    value = np.where(known, value, ratio + np.log(noise.new_rate))
+    more = R_world_camera @ np.linalg.inv(covariance) @ R_world_camera.T
+    for k, landmark in enumerate(landmarks):
+        landmark.log_odds += float(value[k])
+        landmark.information = landmark.information + more[k]
 
 
 def told_variance(landmarks: list[RunningLandmark], correlation: float) -> Float[np.ndarray, "m d"]:
