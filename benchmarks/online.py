@@ -23,7 +23,6 @@ from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
 
-
 def ate(T: np.ndarray, truth: np.ndarray) -> float:
     """ATE after alignment, m."""
     return absolute_trajectory_error(T, truth).rmse
@@ -75,9 +74,7 @@ def drive_laps(arguments: Arguments, seed: int) -> tuple[list[Row], Row]:
     order = np.argsort(table.frame, kind="stable")
     bounds = np.searchsorted(table.frame[order], np.arange(len(truth) + 1))
     first = table.select(table.frame < 100)
-    slam = IncrementalSlam(
-        config, SlamProblem(drive.odometry[:100], first), keyframes=KeyframeConfig(history=arguments.history)
-    )
+    slam = IncrementalSlam(config, SlamProblem(drive.odometry[:100], first), keyframes=KeyframeConfig(history=arguments.history))
     rows: list[Row] = []
     latency: list[float] = []
     seen: set[int] = set()

@@ -7,6 +7,7 @@ from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.em import EmStepInfo, step
 from nolbo_ppl.inference.slam.graph import GraphError, Links
 from nolbo_ppl.inference.slam.ground_truth_association import solve_with_associations
+from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.inference.slam.incremental.online_slam import IncrementalSlam, OnlineInfo, solve_online
 from nolbo_ppl.inference.slam.initialise import SlamState, init
 from nolbo_ppl.inference.slam.map_refinement import finish
@@ -25,6 +26,7 @@ __all__ = [
     "Links",
     "NoiseModel",
     "IncrementalSlam",
+    "KeyframeConfig",
     "OnlineInfo",
     "PlainInfo",
     "PlainState",

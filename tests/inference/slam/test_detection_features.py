@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.slam import SlamConfig
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.detection_features import (
     LARGE_VARIANCE,
     FeaturePrior,
     correlated_variance,
-    fuse_latent,
     weighted_latents,
 )
-from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser, Track
+from nolbo_ppl.inference.slam.incremental.running_map import new_landmark, told_variance
+from nolbo_ppl.inference.slam.measurements import resolve
+from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
+from nolbo_ppl.structures.detections import make_table
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9])
@@ -37,22 +37,23 @@ def test_variance_of_correlated_views_is_that_of_their_mean(correlation: float) 
 
 
 def test_the_online_system_widens_latents_of_views_that_are_alike() -> None:
-    """What it compares tracks by has the variance that the batch computes from the same views."""
-    table_latent, scale, views = np.array([[0.2, -1.0]]), np.array([[0.3, 0.5]]), 4
-    fused, variance = table_latent[0], scale[0] ** 2
-    for _ in range(views - 1):
-        fused, variance = fuse_latent(fused, variance, table_latent[0], scale[0] ** 2)
-    config = SlamConfig(latent_correlation=0.6)
-    closer = LoopCloser(config, FeaturePrior(np.zeros(2), np.ones(2), (), np.zeros(0), 0.9))
-    track = Track(list(range(views)), 0, fused, variance, -1, 1, False, 0, views)
-    closer.add(track)
-    closer.add(replace(track, rows=[0], latent_variance=scale[0] ** 2))
-    features = closer._features(np.arange(2), np.array([True, False]))
-    batch = weighted_latents(
-        np.repeat(table_latent, views, 0), np.repeat(scale**2, views, 0), np.zeros(views, int), np.ones(views), 1
-    )[1]
-    expected = correlated_variance(batch, np.array([float(views)]), 0.6)[0]
-    np.testing.assert_allclose(features.latent_variance, [expected, scale[0] ** 2])
+    """A landmark's latent has the variance that the batch computes from the same views, over two passes together."""
+    latent, scale, views, correlation = np.array([[0.2, -1.0]]), np.array([[0.3, 0.5]]), 4, 0.6
+    prior = FeaturePrior(np.zeros(2), np.ones(2), (), np.zeros(0), 0.9)
+    table = make_table(np.zeros(1, int), np.ones((1, 3)), latent=latent, latent_scale=scale)
+    problem = SlamProblem(np.eye(4)[None], table)
+    config = SlamConfig()
+    seen = resolve(table, estimate_noise(problem, config), config, prior)
+    first, second, single = (new_landmark(j, 0, 0, prior, 1) for j in range(3))
+    for frame in range(views):
+        (first if frame < 3 else second).add(frame, seen, 0, table.size[0])
+    single.add(0, seen, 0, table.size[0])
+    first.absorb(second)
+    rows = np.zeros(views, int)
+    batch_mean, batch = weighted_latents(np.repeat(latent, views, 0), np.repeat(scale**2, views, 0), rows, np.ones(views), 1)
+    expected = correlated_variance(batch, np.array([float(views)]), correlation)[0]
+    np.testing.assert_allclose(told_variance([first, single], correlation), [expected, scale[0] ** 2], rtol=1e-9)
+    np.testing.assert_allclose(first.latent, batch_mean[0], rtol=1e-9)
 
 
 def test_one_view_and_missing_latents_stay() -> None:

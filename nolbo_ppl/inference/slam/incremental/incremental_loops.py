@@ -105,9 +105,7 @@ class LoopCloser:
             self._place(j, T[:3, 3])
         everyone = landmarks + drafts
         fresh = np.arange(len(old), len(everyone))
-        features = landmark_features(
-            everyone, fresh, self.map.population(), self.config.latent_correlation or 0.0
-        )
+        features = landmark_features(everyone, fresh, self.map.population(), self.config.latent_correlation or 0.0)
         errors = np.concatenate([error[self.drift.rows(np.array([j.place for j in landmarks]))], np.tile(here, (count, 1, 1))])
         samples = landmark_samples(T_all, everyone, noise, errors, rng)
         pairs = compare(T_all, samples, features, everyone, fresh, self.map, self.config, floor)
@@ -237,7 +235,11 @@ class LoopCloser:
             self.map.position[k] = graph.landmark(j)[:3, 3]
         # The map has moved: what found no partner before may find one now.
         since = frame - 2 * LONGEST_WAIT
-        again = [j for j in self.map.numbers.tolist() if j >= oldest - self.config.constellation_size and self.map.landmarks[j].first >= since]
+        again = [
+            j
+            for j in self.map.numbers.tolist()
+            if j >= oldest - self.config.constellation_size and self.map.landmarks[j].first >= since
+        ]
         self.fresh = sorted({*self.fresh, *again})
         return True
 

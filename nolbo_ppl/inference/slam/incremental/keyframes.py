@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 

@@ -9,7 +9,8 @@ tracks that found no landmark one window of them is matched to all older ones, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 from jaxtyping import Float
@@ -17,15 +18,18 @@ from jaxtyping import Float
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
-from nolbo_ppl.inference.slam.detection_features import detection_features, fit_prior
+from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE, LoopCloser
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
+from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.map_answers import map_landmarks
-from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, count_detections, new_landmark
-from nolbo_ppl.inference.slam.initialise import init, init_from_tracklets
+from nolbo_ppl.inference.slam.incremental.online_calibration import calibrate_online, default_calibration
+from nolbo_ppl.inference.slam.incremental.online_state import load_state, save_state
+from nolbo_ppl.inference.slam.incremental.running_map import RunningMap, count_detections, new_landmark
+from nolbo_ppl.inference.slam.initialise import init_from_tracklets
+from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
-from nolbo_ppl.inference.slam.orientation import observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
@@ -53,20 +57,6 @@ class OnlineInfo:
     """Tracks put to landmarks met again at this keyframe."""
     keyframes: int = 0
     """Poses in the running graph."""
-
-
-@dataclass
-class LiveTrack:
-    """A track the tracker still follows."""
-
-    landmark: int
-    """Its landmark, -1 while it has none."""
-    draft: RunningLandmark
-    """What it gathered until then."""
-    waiting: list[tuple[int, SlamProblem, NoiseModel, int]] = field(default_factory=list)
-    """Detections that wait for a landmark: keyframe, its problem and scales, and the row."""
-    last: int = 0
-    """Newest frame."""
 
 
 class IncrementalSlam:
@@ -127,10 +117,11 @@ class IncrementalSlam:
             raise input_error("odometry_covariance is given for some keyframes only", do="give it for all or for none")
         table = replace(observations, frame=np.zeros(len(observations), dtype=np.int64))
         problem = SlamProblem(odometry[None], table)  # checks the detections
-        self._begin(table)
+        self._begin(problem)
         noise = self._noise(problem)
         rotation, translation = self._add_pose(odometry, frame, odometry_covariance)
-        assigned, weight = self._track(table, noise, odometry, frame, rotation, translation)
+        measurements = resolve(table, noise, self.config, self.prior)
+        assigned, weight = self._track(measurements, odometry, frame, rotation, translation)
         self.frames += 1
         self.last_odometry = odometry
         if self.keyframes.history:
@@ -138,7 +129,7 @@ class IncrementalSlam:
             self.tables.append(replace(table, frame=np.full(len(table), frame, dtype=np.int64)))
             self.assigned.append(assigned)
             self.weights.append(weight)
-        met = self._map(problem, noise, assigned, frame)
+        met = self._map(table, measurements, noise, assigned, frame)
         self.keeper.advance(frame, self.graph)
         self.graph.commit()
         closings = self.loops.close(frame, self.graph, noise, self._live())
@@ -149,61 +140,32 @@ class IncrementalSlam:
         """Landmarks that belong to live tracks."""
         return {self.loops.map.standing(t.landmark) for t in self.tracks.values() if t.landmark >= 0}
 
-    def _begin(self, table: Detections) -> None:
+    def _begin(self, first: SlamProblem) -> None:
         """At the first keyframe: scales of the reference, and the prior of features."""
         if self.tracker is not None:
             return
         if self.calibration is not None:
-            state = init(self.calibration, self.config)
-            reference, self.prior = state.noise, state.prior
-            report = reference.report
-            config = self.config
-            ratio = config.odometry_translation_ratio
-            constant = config.odometry_translation_scale
-            if ratio is None and constant is None:
-                length = np.linalg.norm(np.diff(self.calibration.odometry[:, :3, 3], axis=0), axis=1)
-                ratio = float(np.median(reference.translation_step) / max(np.median(length), 1e-9))
-                constant = 0.2 * float(np.median(reference.translation_step))
-            lateral, radial = report.get("position_lateral"), report.get("position_radial")
-            position, growth = config.position_scale, config.position_ratio
-            if position is None and growth is None and lateral is not None and radial is not None:
-                width = max(report.get("position_track_width", 1.0), 1.0) * 1.2
-                position = width * max(lateral, radial)
-                growth = width * max(report["position_lateral_ratio"], report["position_radial_ratio"])
-            self.config = replace(
-                config,
-                odometry_rotation_scale=float(np.median(reference.rotation_step)),
-                odometry_translation_ratio=ratio,
-                odometry_translation_scale=constant,
-                position_scale=position,
-                position_ratio=growth,
-                rotation_scale=config.rotation_scale or float(np.median(reference.rotation_scale))
-                if len(reference.rotation_scale)
-                else config.rotation_scale,
-                latent_scale=config.latent_scale or (report.get("latent_scale") if "latent_scale" in report else None),
-                new_rate=reference.new_rate,
-                clutter_rate=reference.clutter_rate,
-            )
-            self.factors = (reference.position_factor, reference.range_factor, reference.rotation_factor)
+            self.scales = calibrate_online(self.calibration, self.config)
         else:
-            self.prior = fit_prior(table, self.config)
-            self.factors = (1.0, 1.0, 1.0)
-            rate = 1e-3
-            self.config = replace(
-                self.config, new_rate=self.config.new_rate or rate, clutter_rate=self.config.clutter_rate or 0.5 * rate
-            )
+            self.scales = default_calibration(first, self.config)
+        self.config, self.prior = self.scales.config, self.scales.prior
         self.loops = LoopCloser(self.config, RunningMap(self.prior))
-        self.tracker = Tracker(
-            self.config,
-            table.latent_dim,
-            self.prior,
-            float(self.config.new_rate or 1e-3),
-            float(self.config.clutter_rate or 1e-3),
-        )
+        self.tracker = self.new_tracker()
+
+    def new_tracker(self) -> Tracker:
+        """A tracker without tracks, under the scales in use."""
+        new_rate, clutter_rate = self.config.new_rate, self.config.clutter_rate
+        assert new_rate is not None and clutter_rate is not None  # the calibration states both
+        return Tracker(self.config, len(self.prior.mean), self.prior, new_rate, clutter_rate)
 
     def _noise(self, problem: SlamProblem) -> NoiseModel:
-        noise = estimate_noise(problem, self.config)
-        return replace(noise, position_factor=self.factors[0], range_factor=self.factors[1], rotation_factor=self.factors[2])
+        scales = self.scales
+        return replace(
+            estimate_noise(problem, self.config),
+            position_factor=scales.position_factor,
+            range_factor=scales.range_factor,
+            rotation_factor=scales.rotation_factor,
+        )
 
     def _add_pose(self, odometry: np.ndarray, frame: int, covariance: np.ndarray | None) -> tuple[float, float]:
         """Odometry factor and first value of the new pose; scales of the step."""
@@ -235,8 +197,7 @@ class IncrementalSlam:
 
     def _track(
         self,
-        table: Detections,
-        noise: NoiseModel,
+        measurements: Measurements,
         odometry: np.ndarray,
         frame: int,
         rotation: float,
@@ -246,43 +207,27 @@ class IncrementalSlam:
         assert tracker is not None
         if frame:
             tracker.predict(odometry, frame, rotation, translation)
-        if not len(table):
+        if not len(measurements):
             return np.zeros(0, dtype=np.int64), np.zeros(0)
-        R = odometry[:3, :3]
-        latent, variance, category = detection_features(table, noise, self.prior)
-        return tracker.associate(
-            transform(odometry, table.position),
-            R @ noise.position_covariance @ R.T,
-            observed_modes(table, noise.rotation_scale).turned(R),
-            table.has_rotation,
-            resolved_symmetry(table, self.config),
-            latent,
-            variance,
-            category,
-            np.clip(table.objectness, *self.config.objectness_limits),
-            frame,
-        )
+        return tracker.associate(measurements.in_world(np.tile(odometry, (len(measurements), 1, 1))), frame)
 
-    def _map(self, problem: SlamProblem, noise: NoiseModel, assigned: np.ndarray, frame: int) -> int:
+    def _map(self, table: Detections, measurements: Measurements, noise: NoiseModel, assigned: np.ndarray, frame: int) -> int:
         """Put this keyframe's detections to landmarks; returns how many tracks met an old one.
 
         A track asks for its landmark with its second detection (`track_minimum`), or later where it is not sure.
         """
-        table = problem.observations
-        latent, variance, category = detection_features(table, noise, self.prior)
-        symmetry, oriented = resolved_symmetry(table, self.config), table.has_rotation
         asking: list[tuple[int, int]] = []
         for i, number in enumerate(assigned.tolist()):
             if number < 0:
                 continue
             if number not in self.tracks:
-                draft = new_landmark(-1, self.loops.drift.place, frame, self.prior, int(symmetry[i]))
+                draft = new_landmark(-1, self.loops.drift.place, frame, self.prior, int(measurements.symmetry[i]))
                 self.tracks[number] = LiveTrack(-1, draft)
             track = self.tracks[number]
             track.last = frame
             if track.landmark < 0:
-                track.draft.add(frame, latent[i], variance[i], int(category[i]), table.size[i], bool(oriented[i]))
-                track.waiting.append((frame, problem, noise, i))
+                track.draft.add(frame, measurements, i, table.size[i])
+                track.waiting.append((frame, measurements.select(np.array([i]))))
                 if len(track.waiting) >= self.config.track_minimum:
                     asking.append((number, i))
         met = self._ask(asking, table, noise, frame)
@@ -292,22 +237,42 @@ class IncrementalSlam:
                 continue
             track = self.tracks[number]
             track.landmark = self.loops.map.standing(track.landmark)
-            for earlier, its_problem, its_noise, k in track.waiting[:-1]:
-                pose = self.graph.pose(earlier)
-                T = self.graph.observe(its_problem, its_noise, self.config, [k], earlier, pose, [track.landmark])
-                self._account(its_problem.observations, its_noise, [k], pose, [track.landmark], T)
+            for earlier, measurement in track.waiting[:-1]:
+                if earlier in self.graph.of_pose:  # else it has left the window
+                    self._observe(measurement, noise, [0], earlier, self.graph.pose(earlier), [track.landmark])
             if not track.waiting:
-                landmark = self.loops.map.landmarks[track.landmark]
-                landmark.add(frame, latent[i], variance[i], int(category[i]), table.size[i], bool(oriented[i]))
+                self.loops.map.landmarks[track.landmark].add(frame, measurements, i, table.size[i])
             track.waiting = []
             rows.append(i)
             landmarks.append(track.landmark)
-        T = self.graph.observe(problem, noise, self.config, rows, frame, self.T_world_camera, landmarks)
-        self._account(table, noise, rows, self.T_world_camera, landmarks, T)
+        self._observe(measurements, noise, rows, frame, self.T_world_camera, landmarks)
         self.keeper.saw(frame, [self.loops.map.landmarks[j].passes > 1 for j in landmarks])
         for number in [n for n, track in self.tracks.items() if frame - track.last > self.config.track_gap]:
             del self.tracks[number]
         return met
+
+    def _observe(
+        self,
+        measurements: Measurements,
+        noise: NoiseModel,
+        rows: list[int],
+        frame: int,
+        T_world_camera: Float[np.ndarray, "4 4"],
+        landmarks: list[int],
+    ) -> None:
+        """Factors of detections of one keyframe, and their evidence that there are objects (see `map_answers`)."""
+        if not rows:
+            return
+        T = self.graph.observe(measurements, noise, self.config, rows, frame, T_world_camera, landmarks)
+        error = transform(inverse(T_world_camera), T[:, :3, 3]) - measurements.position[rows]
+        count_detections(
+            [self.loops.map.landmarks[j] for j in landmarks],
+            error,
+            T_world_camera[:3, :3],
+            measurements.covariance[rows],
+            (measurements.log_object - measurements.log_clutter)[rows],
+            noise,
+        )
 
     def _ask(self, asking: list[tuple[int, int]], table: Detections, noise: NoiseModel, frame: int) -> int:
         """Give tracks their landmarks: one met again where that is sure, else a new one; the unsure may wait."""
@@ -336,29 +301,6 @@ class IncrementalSlam:
         R = self.T_world_camera[:3, :3] @ table.rotation[i] if table.has_rotation[i] else np.eye(3)
         return make_pose(R, transform(self.T_world_camera, table.position[i]))
 
-    def _account(
-        self,
-        table: Detections,
-        noise: NoiseModel,
-        rows: list[int],
-        T_world_camera: Float[np.ndarray, "4 4"],
-        landmarks: list[int],
-        T_world_landmark: Float[np.ndarray, "k 4 4"],
-    ) -> None:
-        """Evidence of each detection that its landmark is an object (see `existence`)."""
-        if not rows:
-            return
-        error = transform(inverse(T_world_camera), T_world_landmark[:, :3, 3]) - table.position[rows]
-        objectness = np.clip(table.objectness[rows], *self.config.objectness_limits)
-        count_detections(
-            [self.loops.map.landmarks[j] for j in landmarks],
-            error,
-            T_world_camera[:3, :3],
-            noise.position_covariance[rows],
-            objectness,
-            noise,
-        )
-
     # -- answers ------------------------------------------------------------------------------------------------------
 
     def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
@@ -381,6 +323,36 @@ class IncrementalSlam:
         self.loops.flush(self.frames - 1, self.graph)
         return map_landmarks(self.loops.map, self.graph, self.config)
 
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything to one NPZ file; `load` goes on from it bit for bit as this system does from here.
+
+        Raises:
+            InputError: no keyframe was given.
+
+        Example:
+            >>> import pathlib, tempfile
+            >>> from nolbo_ppl.structures.detections import make_table
+            >>> slam = IncrementalSlam()
+            >>> _ = slam.update(np.eye(4), make_table([0], np.array([[0.0, 0.0, 5.0]])))
+            >>> file = pathlib.Path(tempfile.mkdtemp()) / "online.npz"
+            >>> slam.save(file)
+            >>> IncrementalSlam.load(file).frames
+            1
+        """
+        self._started()
+        save_state(self, path)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> IncrementalSlam:
+        """The system that `save` wrote.
+
+        Raises:
+            InputError: no such file, damaged, or not of this kind; names it.
+        """
+        slam = cls()
+        load_state(slam, path)
+        return slam
+
     def _started(self) -> None:
         if not self.frames:
             raise input_error("no keyframe was given", do="call update first")
@@ -397,7 +369,7 @@ class IncrementalSlam:
         covariance = np.array(self.step_covariances) if self.step_covariances else None
         problem = SlamProblem(np.array(self.odometry), concatenate(self.tables), covariance)
         noise = estimate_noise(problem, self.config)
-        prior = fit_prior(problem.observations, self.config)
+        prior = fit_prior(problem.observations, self.config, noise)
         tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
         state = init_from_tracklets(problem, self.config, noise, prior, tracklets)
         return complete(state)

@@ -20,6 +20,7 @@ from nolbo_ppl.inference.slam.detection_features import (
 )
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
+from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel
 from nolbo_ppl.inference.slam.slam_state import link_scale
 
@@ -70,14 +71,16 @@ class RunningLandmark:
     passes: int = 1
     """Tracks it was made of."""
 
-    def add(self, frame: int, latent: np.ndarray, variance: np.ndarray, category: int, size: np.ndarray, oriented: bool) -> None:
-        """One more detection."""
+    def add(self, frame: int, measurements: Measurements, row: int, size: Float[np.ndarray, " 3"]) -> None:
+        """One more detection: a row of measurements, and its extent (NaN: none)."""
         self.views += 1
         self.first, self.last = min(self.first, frame), max(self.last, frame)
         self.frames.append(frame)
-        self.oriented |= oriented
+        self.oriented |= bool(measurements.oriented[row])
+        category = int(measurements.category[row])
         if category >= 0:
             self.votes[category] += 1.0
+        latent, variance = measurements.latent[row], measurements.latent_variance[row]
         if len(variance) and variance[0] < LARGE_VARIANCE:
             self.latent, self.latent_variance = fuse_latent(self.latent, self.latent_variance, latent, variance)
             self.latent_views += 1
@@ -87,9 +90,7 @@ class RunningLandmark:
 
     def absorb(self, other: RunningLandmark) -> None:
         """Take over the detections of another landmark that is the same object."""
-        self.latent, self.latent_variance = fuse_latent(
-            self.latent, self.latent_variance, other.latent, other.latent_variance
-        )
+        self.latent, self.latent_variance = fuse_latent(self.latent, self.latent_variance, other.latent, other.latent_variance)
         self.first, self.last = min(self.first, other.first), max(self.last, other.last)
         self.votes = self.votes + other.votes
         self.oriented |= other.oriented
@@ -131,7 +132,7 @@ def count_detections(
     error: Float[np.ndarray, "k 3"],
     R_world_camera: Float[np.ndarray, "3 3"],
     covariance: Float[np.ndarray, "k 3 3"],
-    objectness: Float[np.ndarray, " k"],
+    score: Float[np.ndarray, " k"],
     noise: NoiseModel,
 ) -> None:
     """Evidence of detections of one keyframe that their landmarks are objects rather than background (see `map_answers`).
@@ -140,13 +141,13 @@ def count_detections(
         landmarks: the landmark of each detection.
         error: position predicted less observed, in the camera frame, m.
         covariance: of the observed positions in the camera frame, m^2.
-        objectness: probability of each detection being an object.
+        score: log likelihood ratio of each detection's score, object over clutter.
         noise: the rates.
     """
-    ratio = np.log(objectness) - np.log1p(-objectness) - np.log(noise.clutter_rate)
+    ratio = score - np.log(noise.clutter_rate)
     information = np.array([j.information for j in landmarks])
-    known = information.any(axis=(1, 2))
-    spread = np.linalg.inv(np.where(known[:, None, None], information, np.eye(3))) + link_scale(noise) ** 2 * np.eye(3)
+    known = np.asarray(information.any(axis=(1, 2)))
+    spread = np.linalg.inv(np.where(known.reshape(-1, 1, 1), information, np.eye(3))) + link_scale(noise) ** 2 * np.eye(3)
     value = ratio + log_normal(error, covariance + R_world_camera.T @ spread @ R_world_camera)
     value = np.logaddexp(np.log1p(-RIGHT_TRACK), np.log(RIGHT_TRACK) + value)
     value = np.where(known, value, ratio + np.log(noise.new_rate))

@@ -37,7 +37,7 @@ def assert_covariance(samples: np.ndarray, exact: np.ndarray) -> None:
 def test_errors_add_along_the_drive_and_are_carried_on() -> None:
     graph, rng = DriftGraph(), np.random.default_rng(1)
     added = walk(graph, 40)
-    assert graph.node(np.array([0, 9, 10, 39, 40, 400])).tolist() == [0, 0, 1, 3, 4, 4]
+    assert graph.place == 4 and graph.rows(np.array([0, 1, 4])).tolist() == [0, 1, 4]
     delta = graph.samples(COUNT, rng)
     assert np.abs(delta[0]).max() < 1e-4
     assert_covariance(delta[4], np.sum(added, axis=0))
@@ -52,32 +52,68 @@ def test_errors_add_along_the_drive_and_are_carried_on() -> None:
     assert_covariance(more[3] - more[2], 10 * np.diag(np.repeat([0.01**2, 0.02**2], 3)))
 
 
-def test_closings_tie_what_they_tie() -> None:
-    graph, rng = DriftGraph(), np.random.default_rng(2)
-    added = walk(graph, 30)
-    place, scale = np.array([1.0, 2.0, 20.0]), 0.05
-    graph.samples(COUNT, rng)
-    graph.close(30, 10, place, scale)
+def conditioned(added: list[np.ndarray], place: np.ndarray, scale: float) -> np.ndarray:
+    """Covariance of nodes 1, 2, 3 by dense Gaussian conditioning on `H (e_3 - e_1) ~ N(0, scale^2)`."""
     H = np.concatenate([-skew(place), np.eye(3)], axis=1)
-    # Nodes 1, 2, 3 by dense Gaussian conditioning on H (e3 - e1) = 0 with that scale.
     parts = [np.sum(added[i : i + 10], axis=0) for i in (0, 10, 20)]
     blocks = np.cumsum(parts, axis=0)
     prior = np.block([[blocks[min(i, j)] for j in range(3)] for i in range(3)])
     A = np.concatenate([-H, np.zeros((3, 6)), H], axis=1)
     gain = prior @ A.T @ np.linalg.inv(A @ prior @ A.T + scale**2 * np.eye(3))
-    posterior = prior - gain @ A @ prior
-    assert_covariance(graph.samples(COUNT, rng)[1:].reshape(18, COUNT), posterior)
+    return prior - gain @ A @ prior
+
+
+def test_closings_tie_what_they_tie() -> None:
+    graph, rng = DriftGraph(), np.random.default_rng(2)
+    added = walk(graph, 30)
+    place, scale = np.array([1.0, 2.0, 20.0]), 0.05
+    graph.samples(COUNT, rng)
+    graph.close(3, 1, place, scale)
+    assert_covariance(graph.samples(COUNT, rng)[1:].reshape(18, COUNT), conditioned(added, place, scale))
+
+
+def test_on_known_ground_no_node_is_added_and_the_error_is_filtered() -> None:
+    """The camera's error relative to the place it is at, against the Kalman filter written out."""
+    graph, rng = DriftGraph(), np.random.default_rng(3)
+    added = walk(graph, 25)  # 2 nodes, and 5 steps on from the last
+    graph.samples(COUNT, rng)
+    local, place, scale = np.sum(added[20:], axis=0), np.array([1.0, -1.0, 22.0]), 0.3
+    H = np.concatenate([-skew(place), np.eye(3)], axis=1)
+    np.testing.assert_allclose(graph.local, local, rtol=1e-9)
+    graph.meet(2, place, scale)
+    expected = local - local @ H.T @ np.linalg.inv(H @ local @ H.T + scale**2 * np.eye(3)) @ H @ local
+    np.testing.assert_allclose(graph.local, expected, atol=1e-9)
+    here = graph.samples_here(COUNT, rng) - graph.samples(COUNT, rng)[2]
+    assert_covariance(here, expected)
+    for _ in range(200):  # round and round the same place
+        graph.advance(np.eye(4), 0.01, 0.02)
+        graph.meet(2, place, scale)
+    assert len(graph.gaps) == 3 and graph.place == 2
+    assert np.trace(H @ graph.local @ H.T) < 3 * scale**2
+
+
+def test_a_landmark_of_an_old_place_met_after_drift_closes_a_loop() -> None:
+    graph, rng = DriftGraph(), np.random.default_rng(4)
+    added = walk(graph, 30)
+    graph.samples(COUNT, rng)
+    place = np.array([1.0, 2.0, 20.0])
+    graph.meet(1, place, 0.05)
+    assert len(graph.loops) == 1
+    assert_covariance(graph.samples(COUNT, rng)[1:].reshape(18, COUNT), conditioned(added, place, 0.05))
+    graph.meet(1, place, 0.5)  # nothing left that a loop would tell
+    assert len(graph.loops) == 1
 
 
 def test_nodes_stay_few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drift, "MOST_NODES", 7)
     graph = DriftGraph(stride=2)
     added = walk(graph, 100)
-    assert len(graph.gaps) < 7 and graph.stride >= 16
-    end = len(graph.gaps) * graph.stride
-    assert 100 - end == graph.since
-    assert_covariance(graph.samples(COUNT, np.random.default_rng(3))[-1], np.sum(added[:end], axis=0))
-    assert int(graph.node(np.array(end))) == len(graph.gaps)
+    assert len(graph.gaps) <= 7 and graph.stride >= 16
+    delta = graph.samples(COUNT, np.random.default_rng(3))
+    rest = len(added) - graph.since
+    assert_covariance(delta[graph.here], np.sum(added[:rest], axis=0))
+    rows = graph.rows(np.arange(len(graph.standing)))
+    assert rows[0] == 0 and (np.diff(rows) >= 0).all() and rows[-1] == len(graph.gaps) - 1
 
 
 def test_covariances_widen_along_and_across_the_ray() -> None:

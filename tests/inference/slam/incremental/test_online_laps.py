@@ -1,0 +1,130 @@
+"""Lap after lap round the same objects: one landmark an object, a graph that does not grow, a map while driving."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.inference.slam import IncrementalSlam, OnlineInfo, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
+from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
+from nolbo_ppl.structures.detections import Detections, make_table
+
+LAPS, PER_LAP, OBJECTS = 4, 50, 20
+CONFIG = SlamConfig(odometry_rotation_scale=0.004, odometry_translation_ratio=0.01)
+
+
+def empty_table() -> Detections:
+    return make_table(np.zeros(0, int), np.zeros((0, 3)))
+
+
+def circuit() -> SimulatedSequence:
+    rng = np.random.default_rng(1)
+    truth = simulate_circuit(rng, laps=LAPS, radius=20.0, frames_per_lap=PER_LAP)
+    return simulate_drive(truth, rng, world=WorldConfig(objects=OBJECTS, categories=5, latent_dim=4))
+
+
+def start(drive: SimulatedSequence, keyframes: KeyframeConfig | None = None) -> IncrementalSlam:
+    first = drive.observations.select(drive.observations.frame < PER_LAP)
+    return IncrementalSlam(CONFIG, SlamProblem(drive.odometry[:PER_LAP], first), keyframes)
+
+
+def feed(slam: IncrementalSlam, drive: SimulatedSequence, first: int, last: int) -> list[OnlineInfo]:
+    table = drive.observations
+    return [slam.update(drive.odometry[t], table.select(table.frame == t)) for t in range(first, last)]
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]]:
+    drive = circuit()
+    slam = start(drive, KeyframeConfig(passes=2))
+    infos, factors = [], []
+    for lap in range(LAPS):
+        infos += feed(slam, drive, lap * PER_LAP, (lap + 1) * PER_LAP)
+        factors.append(len(slam.graph.factors))
+    return drive, slam, infos, factors
+
+
+def test_one_landmark_an_object_and_no_growth(
+    driven: tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]],
+) -> None:
+    drive, slam, infos, factors = driven
+    objects = len(np.unique(drive.object_of[drive.object_of >= 0]))
+    assert infos[-1].landmarks <= 1.1 * objects
+    assert sum(info.met for info in infos[-PER_LAP:]) >= 0.8 * objects
+    poses = [infos[(lap + 1) * PER_LAP - 1].keyframes for lap in range(LAPS)]
+    # A lap adds its 50 keyframes and some 200 detections; on known ground almost none of them stay.
+    assert poses[3] - poses[2] <= 3 and poses[3] < 1.8 * PER_LAP
+    assert factors[3] - factors[2] < 0.1 * factors[2]
+    assert len(slam.loops.drift.gaps) < 1.5 * PER_LAP / slam.loops.drift.stride + 3
+    assert len(slam.tracks) < OBJECTS
+
+
+def test_the_trajectory_is_corrected_while_driving(
+    driven: tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]],
+) -> None:
+    drive, slam, infos, _ = driven
+    before = absolute_trajectory_error(drive.odometry, drive.truth).rmse
+    assert absolute_trajectory_error(slam.trajectory(), drive.truth).rmse < 0.3 * before
+    now = infos[-1].T_world_camera[:3, 3]
+    assert np.linalg.norm(now - drive.truth[-1, :3, 3]) < 0.5
+
+
+def test_the_map_answers_at_any_keyframe(
+    driven: tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]],
+) -> None:
+    drive, slam, _, _ = driven
+    landmarks = slam.landmarks()
+    world = drive.world
+    assert world is not None and len(landmarks) == len(slam.loops.map)
+    sure = [j for j in landmarks if j.existence > 0.9]
+    assert len(sure) >= 0.9 * len(landmarks)
+    squared = []
+    for j in sure:
+        gap = world.position - j.T_world_object[:3, 3]
+        nearest = int(np.argmin(np.linalg.norm(gap, axis=1)))
+        squared.append(float(gap[nearest] @ np.linalg.solve(j.position_covariance, gap[nearest])))
+        assert max(j.class_posterior, key=lambda c: j.class_posterior[c]) == f"c{world.category[nearest]}"
+        assert j.latent is not None and j.latent_variance is not None
+        assert (np.abs(j.latent - world.latent[nearest]) < 5 * np.sqrt(j.latent_variance)).all()
+    # Chi-square with 3 degrees of freedom; landmarks of one map share errors, so the mean is not sharp.
+    assert 1.0 < np.mean(squared) < 9.0
+    assert slam.graph.landmark_covariance(landmarks[0].index) == pytest.approx(landmarks[0].covariance)
+
+
+def test_without_history_memory_holds_no_detections() -> None:
+    drive = circuit()
+    slam = start(drive, KeyframeConfig(history=False))
+    infos = feed(slam, drive, 0, 30)
+    assert not slam.tables and not slam.odometry and infos[-1].landmarks == len(slam.landmarks())
+    with pytest.raises(InputError, match="history"):
+        slam.finish()
+
+
+def test_one_keyframe_and_none() -> None:
+    slam = IncrementalSlam()
+    for ask in (slam.landmarks, slam.trajectory, slam.finish):
+        with pytest.raises(InputError, match="no keyframe"):
+            ask()
+    slam.update(np.eye(4), make_table([0], np.array([[0.0, 0.0, 5.0]])))
+    assert slam.landmarks() == () and slam.trajectory().shape == (1, 4, 4)
+    result = slam.finish()
+    assert np.isfinite(result.T_world_camera).all()
+
+
+def test_nothing_to_see_is_odometry() -> None:
+    slam = IncrementalSlam(CONFIG, calibration=SlamProblem(np.eye(4)[None], empty_table()))
+    for k in range(40):
+        T = np.eye(4)
+        T[2, 3] = 0.5 * k
+        info = slam.update(T, empty_table())
+    np.testing.assert_allclose(info.T_world_camera, T, atol=1e-6)
+    assert info.landmarks == 0 and info.keyframes == 40
+
+
+def test_keyframe_settings_are_checked() -> None:
+    for bad in ({"window": 3}, {"stretch": 0}, {"passes": True}, {"least_met": 1.5}):
+        with pytest.raises(InputError):
+            KeyframeConfig(**bad)  # type: ignore[arg-type]

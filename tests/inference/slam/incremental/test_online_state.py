@@ -1,0 +1,69 @@
+"""The online system in a file: what is loaded goes on as what was saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.inference.slam import IncrementalSlam, SlamConfig, SlamProblem
+from nolbo_ppl.io.npz import Npz, save_npz
+
+CONFIG = SlamConfig(odometry_rotation_scale=0.004, odometry_translation_ratio=0.01, latent_correlation=0.2)
+
+
+@pytest.fixture(scope="module")
+def halfway(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedSequence, IncrementalSlam, Path]:
+    rng = np.random.default_rng(2)
+    truth = simulate_circuit(rng, laps=2, radius=20.0, frames_per_lap=50)
+    drive = simulate_drive(truth, rng, world=WorldConfig(objects=20, categories=5, latent_dim=4))
+    table = drive.observations
+    slam = IncrementalSlam(CONFIG, SlamProblem(drive.odometry[:50], table.select(table.frame < 50)))
+    for t in range(80):
+        slam.update(drive.odometry[t], table.select(table.frame == t))
+    path = tmp_path_factory.mktemp("online") / "state.npz"
+    slam.save(path)
+    return drive, slam, path
+
+
+def test_what_is_loaded_goes_on_bit_for_bit(halfway: tuple[SimulatedSequence, IncrementalSlam, Path]) -> None:
+    drive, slam, path = halfway
+    again, table = IncrementalSlam.load(path), drive.observations
+    for t in range(80, 100):
+        rows = table.select(table.frame == t)
+        one, other = slam.update(drive.odometry[t], rows), again.update(drive.odometry[t], rows)
+        np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
+        assert (one.landmarks, one.closings, one.met, one.keyframes) == (
+            other.landmarks,
+            other.closings,
+            other.met,
+            other.keyframes,
+        )
+    np.testing.assert_array_equal(slam.trajectory(), again.trajectory())
+    for a, b in zip(slam.landmarks(), again.landmarks(), strict=True):
+        assert a.existence == b.existence and a.class_posterior == b.class_posterior and a.index == b.index
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+        np.testing.assert_array_equal(a.latent_variance, b.latent_variance)
+    np.testing.assert_array_equal(np.concatenate(slam.assigned), np.concatenate(again.assigned))
+    assert slam.tables[-1].category == again.tables[-1].category
+
+
+def test_files_of_another_kind_are_refused(halfway: tuple[SimulatedSequence, IncrementalSlam, Path], tmp_path: Path) -> None:
+    _, _, path = halfway
+    with pytest.raises(InputError, match="no such"):
+        IncrementalSlam.load(tmp_path / "absent.npz")
+    other = tmp_path / "other.npz"
+    save_npz(other, {"a": np.zeros(3)})
+    with pytest.raises(InputError, match=r"other\.npz"):
+        IncrementalSlam.load(other)
+    with Npz(path) as archive:
+        arrays = {name: archive.array(name, kinds="fiubU", finite=False) for name in archive.names}
+    for name, value in (("graph/T", arrays["graph/T"][:-1]), ("meta", np.array("{}")), ("prior/mean", np.array([np.nan]))):
+        save_npz(other, arrays | {name: value})
+        with pytest.raises(InputError, match=r"other\.npz"):
+            IncrementalSlam.load(other)
+    with pytest.raises(InputError, match="no keyframe"):
+        IncrementalSlam().save(other)
