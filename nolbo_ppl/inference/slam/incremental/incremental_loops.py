@@ -27,7 +27,7 @@ from nolbo_ppl.inference.slam.loop_candidates import (
     candidate_pairs,
 )
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
-from nolbo_ppl.inference.slam.slam_state import link_scale
+from nolbo_ppl.inference.slam.slam_state import link_scale, object_log_density
 
 SURE = 0.9
 """Associations above this weight are made online; the rest waits for more detections, or for the end."""
@@ -117,7 +117,7 @@ class LoopCloser:
         times = np.where(np.arange(len(everyone)) < len(old), frame + 1, frame)
         features = replace(features, first=times, last=times)
         a, b, weight, _ = soft_assignment(
-            pairs, features, np.arange(len(everyone)), float(np.log(noise.new_rate)), replace(self.config, link_minimum=1e-6)
+            pairs, features, np.arange(len(everyone)), object_log_density(noise), replace(self.config, link_minimum=1e-6)
         )
         for i, j, w in zip(a.tolist(), b.tolist(), weight.tolist()):
             k = i - len(old)
@@ -180,7 +180,7 @@ class LoopCloser:
         places = self.drift.rows(np.array([j.place for j in landmarks]))
         samples = landmark_samples(T, landmarks, noise, error[places], rng)
         pairs = compare(T, samples, features, landmarks, fresh, self.map, self.config, floor)
-        found = find_merges(pairs, fresh, T, samples, features, self.config, floor=floor, new_rate=noise.new_rate)
+        found = find_merges(pairs, fresh, T, samples, features, self.config, floor=floor, log_new=object_log_density(noise))
         if found:
             self._note(found, near, T, features, floor)
             if frame - self.solved_at >= SOLVE_INTERVAL:
@@ -297,12 +297,12 @@ def find_merges(
     config: SlamConfig,
     *,
     floor: float,
-    new_rate: float,
+    log_new: float,
 ) -> list[tuple[int, int]]:
     """Fresh landmarks that are older ones: a constellation when one passes, then single ones that are sure."""
     estimate = SlamEstimate(np.zeros((0, 4, 4)), T_world_landmark)
     outside = pairs.select(~np.isin(pairs.b, fresh))
-    closing = find_closing(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=float(np.log(5.0 * new_rate)))
+    closing = find_closing(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=log_new)
     found: list[tuple[int, int]] = []
     least = config.constellation_log_odds
     if closing and closing.log_odds > least and closing.margin > least / 2:
@@ -310,7 +310,7 @@ def find_merges(
     used = [i for pair in found for i in pair]
     rest = sharp(pairs.select(~np.isin(pairs.a, used) & ~np.isin(pairs.b, used)), samples, floor)
     if len(rest):
-        a, b, weight, _ = soft_assignment(rest, features, np.arange(len(features.first)), float(np.log(new_rate)), config)
+        a, b, weight, _ = soft_assignment(rest, features, np.arange(len(features.first)), log_new, config)
         for k in np.argsort(-weight, kind="stable"):
             if weight[k] > SURE and int(a[k]) not in used and int(b[k]) not in used:
                 found.append((int(a[k]), int(b[k])))

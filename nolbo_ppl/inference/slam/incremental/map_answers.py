@@ -3,7 +3,7 @@
 Existence: every detection that was put to a landmark multiplies the odds that there is an object by
 `1 - s + s N(x_k | the landmark so far) q(o_k) / ((1 - q(o_k)) lambda_clutter)`, where s is the probability that the detection
 was put to the right landmark; the first one by `lambda_new q(o_1) / ((1 - q(o_1)) lambda_clutter)`. The product of predictive
-densities is the marginal likelihood (chain rule).
+densities is the marginal likelihood (chain rule). Categories: as the batch does, from the votes of all views (`class_posterior`).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.inference.slam.class_posterior import class_posterior, fit_confusion
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, told_variance
@@ -18,15 +19,14 @@ from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.structures.landmark import Landmark
 
 
-def class_posterior(landmark: RunningLandmark, prior: FeaturePrior, error: float) -> dict[str, float]:
-    """Posterior over categories from the detections of a landmark; empty where none was reported."""
-    count = len(prior.categories)
-    if not count:
-        return {}
-    wrong = np.log(error / max(count - 1, 1))
-    log_posterior = prior.log_frequency + landmark.votes * (np.log1p(-error) - wrong)
-    log_posterior = log_posterior - np.logaddexp.reduce(log_posterior)
-    return {name: float(p) for name, p in zip(prior.categories, np.exp(log_posterior))}
+def class_posteriors(landmarks: list[RunningLandmark], prior: FeaturePrior) -> list[dict[str, float]]:
+    """Posterior over categories of every landmark from the votes of its views; empty where no category is known."""
+    if not prior.categories:
+        return [{} for _ in landmarks]
+    votes = np.array([j.votes for j in landmarks])
+    confusion = fit_confusion(votes, prior.log_frequency, prior.category_error)
+    posterior = class_posterior(votes, prior.log_frequency, confusion)
+    return [{name: float(p) for name, p in zip(prior.categories, row)} for row in posterior]
 
 
 def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConfig) -> tuple[Landmark, ...]:
@@ -35,6 +35,7 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
     if not landmarks:
         return ()
     variance: Float[np.ndarray, "m d"] = told_variance(landmarks, config.latent_correlation or 0.0)
+    classes = class_posteriors(landmarks, running.prior)
     out = []
     for row, landmark in enumerate(landmarks):
         T = graph.landmark(landmark.number)
@@ -48,7 +49,7 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
                 position_covariance=T[:3, :3] @ covariance[3:, 3:] @ T[:3, :3].T,
                 oriented=landmark.oriented,
                 existence=float(1.0 / (1.0 + np.exp(-np.clip(landmark.log_odds, -700, 700)))),
-                class_posterior=class_posterior(landmark, running.prior, config.category_error),
+                class_posterior=classes[row],
                 latent=landmark.latent if known else None,
                 latent_variance=variance[row] if known else None,
                 size=landmark.size / landmark.sizes if landmark.sizes else None,
