@@ -19,12 +19,12 @@ from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
 from nolbo_ppl.inference.slam.detection_features import fit_prior
-from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE, LoopCloser
-from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
+from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.map_answers import map_landmarks
 from nolbo_ppl.inference.slam.incremental.online_calibration import calibrate_online, default_calibration
+from nolbo_ppl.inference.slam.incremental.online_memory import OnlineMemory
 from nolbo_ppl.inference.slam.incremental.online_state import load_state, save_state
 from nolbo_ppl.inference.slam.incremental.running_map import RunningMap, count_detections, new_landmark
 from nolbo_ppl.inference.slam.initialise import init_from_tracklets
@@ -33,7 +33,7 @@ from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STE
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
-from nolbo_ppl.inference.slam.tracking import Tracker, summarise_tracks
+from nolbo_ppl.inference.slam.tracking import summarise_tracks
 from nolbo_ppl.io.observations import Detections, concatenate
 from nolbo_ppl.structures.landmark import Landmark
 
@@ -59,7 +59,7 @@ class OnlineInfo:
     """Poses in the running graph."""
 
 
-class IncrementalSlam:
+class IncrementalSlam(OnlineMemory):
     """Object SLAM fed keyframe by keyframe: `update(odometry, observations)`, then `finish()`.
 
     Scales that the configuration does not state are taken from a reference problem (the first part of a drive, or an
@@ -72,22 +72,8 @@ class IncrementalSlam:
         calibration: SlamProblem | None = None,
         keyframes: KeyframeConfig | None = None,
     ) -> None:
-        self.config = config or SlamConfig()
+        super().__init__(config or SlamConfig(), keyframes or KeyframeConfig())
         self.calibration = calibration
-        self.keyframes = keyframes or KeyframeConfig()
-        self.tracker: Tracker | None = None
-        self.frames = 0
-        self.last_odometry = np.eye(4)
-        self.odometry: list[np.ndarray] = []
-        self.tables: list[Detections] = []
-        self.assigned: list[np.ndarray] = []
-        self.weights: list[np.ndarray] = []
-        self.step_covariances: list[np.ndarray] = []
-        self.stated: bool | None = None
-        self.tracks: dict[int, LiveTrack] = {}
-        self.graph = IncrementalGraph()
-        self.keeper = KeyframeKeeper(self.keyframes)
-        self.T_world_camera = np.eye(4)
 
     # -- one keyframe -------------------------------------------------------------------------------------------------
 
@@ -151,12 +137,6 @@ class IncrementalSlam:
         self.config, self.prior = self.scales.config, self.scales.prior
         self.loops = LoopCloser(self.config, RunningMap(self.prior))
         self.tracker = self.new_tracker()
-
-    def new_tracker(self) -> Tracker:
-        """A tracker without tracks, under the scales in use."""
-        new_rate, clutter_rate = self.config.new_rate, self.config.clutter_rate
-        assert new_rate is not None and clutter_rate is not None  # the calibration states both
-        return Tracker(self.config, len(self.prior.mean), self.prior, new_rate, clutter_rate)
 
     def _noise(self, problem: SlamProblem) -> NoiseModel:
         scales = self.scales

@@ -11,7 +11,7 @@ from collections import deque
 from dataclasses import asdict, fields
 from itertools import pairwise
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +23,13 @@ from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser, M
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.online_calibration import OnlineCalibration
+from nolbo_ppl.inference.slam.incremental.online_memory import OnlineMemory
 from nolbo_ppl.inference.slam.incremental.running_map import FRAMES_KEPT, RunningLandmark, RunningMap
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.structures.detections import ARRAYS, TEXTS, Detections, concatenate
-
-if TYPE_CHECKING:
-    from nolbo_ppl.inference.slam.incremental.online_slam import IncrementalSlam
 
 VERSION = 1
 """Version of the file."""
@@ -55,7 +53,7 @@ DRIFT_NUMBERS = ("stride", "here", "place", "since", "moved_at", "steps")
 MEASUREMENTS = tuple(f.name for f in fields(Measurements) if f.name != "modes")
 
 
-def save_state(slam: IncrementalSlam, path: str | PathLike[str]) -> None:
+def save_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
     """Write a system that has taken at least one keyframe."""
     slam.graph.rebuild()
     arrays: dict[str, Any] = {}
@@ -86,7 +84,7 @@ def save_state(slam: IncrementalSlam, path: str | PathLike[str]) -> None:
     save_npz(path, arrays)
 
 
-def load_state(slam: IncrementalSlam, path: str | PathLike[str]) -> None:
+def load_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
     """Put what a file holds into a new system.
 
     Raises:
@@ -219,7 +217,7 @@ def _put_loops(loops: LoopCloser, arrays: dict[str, Any], meta: dict[str, Any]) 
     arrays["drift/kept"] = np.zeros((0, 6, 0)) if drift.kept is None else drift.kept[1]
 
 
-def _get_loops(slam: IncrementalSlam, archive: Npz, meta: dict[str, Any]) -> LoopCloser:
+def _get_loops(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> LoopCloser:
     running = RunningMap(slam.prior)
     landmarks = _get_landmarks("landmark", archive)
     running.landmarks = {j.number: j for j in landmarks}
@@ -248,7 +246,7 @@ def _get_loops(slam: IncrementalSlam, archive: Npz, meta: dict[str, Any]) -> Loo
 # -- tracks -------------------------------------------------------------------------------------------------------------
 
 
-def _put_tracks(slam: IncrementalSlam, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
+def _put_tracks(slam: OnlineMemory, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
     tracker = slam.tracker
     assert tracker is not None
     for name in TRACKER_ARRAYS:
@@ -272,7 +270,7 @@ def _put_tracks(slam: IncrementalSlam, arrays: dict[str, Any], meta: dict[str, A
     }
 
 
-def _get_tracks(slam: IncrementalSlam, archive: Npz, meta: dict[str, Any]) -> None:
+def _get_tracks(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> None:
     tracker = slam.new_tracker()
     for name in TRACKER_ARRAYS:
         setattr(tracker, name, archive.array(f"tracker/{name}", kinds="fib"))
@@ -294,7 +292,7 @@ def _get_tracks(slam: IncrementalSlam, archive: Npz, meta: dict[str, Any]) -> No
 # -- history ------------------------------------------------------------------------------------------------------------
 
 
-def _put_history(slam: IncrementalSlam, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
+def _put_history(slam: OnlineMemory, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
     if not slam.keyframes.history:
         return
     table = concatenate(slam.tables)
@@ -306,7 +304,7 @@ def _put_history(slam: IncrementalSlam, arrays: dict[str, Any], meta: dict[str, 
     arrays["history/step_covariance"] = np.array(slam.step_covariances).reshape(-1, 6, 6)
 
 
-def _get_history(slam: IncrementalSlam, archive: Npz, meta: dict[str, Any]) -> None:
+def _get_history(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> None:
     if not slam.keyframes.history:
         return
     columns: dict[str, Any] = {name: archive.array(f"history/{name}", finite=False) for name in ARRAYS}

@@ -1,0 +1,47 @@
+"""Everything the online system holds between two keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
+from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser
+from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
+from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
+from nolbo_ppl.inference.slam.incremental.online_calibration import OnlineCalibration
+from nolbo_ppl.inference.slam.slam_problem import SlamConfig
+from nolbo_ppl.inference.slam.tracking import Tracker
+from nolbo_ppl.structures.detections import Detections
+
+
+class OnlineMemory:
+    """What a keyframe reads and leaves behind; what `online_state` writes to a file."""
+
+    config: SlamConfig
+    keyframes: KeyframeConfig
+    scales: OnlineCalibration
+    prior: FeaturePrior
+    loops: LoopCloser
+
+    def __init__(self, config: SlamConfig, keyframes: KeyframeConfig) -> None:
+        self.config, self.keyframes = config, keyframes
+        self.tracker: Tracker | None = None
+        self.frames = 0
+        self.last_odometry = np.eye(4)
+        self.odometry: list[np.ndarray] = []
+        self.tables: list[Detections] = []
+        self.assigned: list[np.ndarray] = []
+        self.weights: list[np.ndarray] = []
+        self.step_covariances: list[np.ndarray] = []
+        self.stated: bool | None = None
+        self.tracks: dict[int, LiveTrack] = {}
+        self.graph = IncrementalGraph()
+        self.keeper = KeyframeKeeper(keyframes)
+        self.T_world_camera = np.eye(4)
+
+    def new_tracker(self) -> Tracker:
+        """A tracker without tracks, under the scales in use."""
+        new_rate, clutter_rate = self.config.new_rate, self.config.clutter_rate
+        assert new_rate is not None and clutter_rate is not None  # the calibration states both
+        return Tracker(self.config, len(self.prior.mean), self.prior, new_rate, clutter_rate)
