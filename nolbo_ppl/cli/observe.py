@@ -31,8 +31,9 @@ class ObserveConfig:
     before frame10), the same as in `nolbo odometry` and `nolbo run`."""
     out: Path
     """Folder for observations.jsonl and the pictures."""
-    model: str = "tiny"
-    """Name of weights in the package, or a folder with a model of your own."""
+    model: str = "photo"
+    """Name of weights in the package (`photo` for photographs, `tiny` for generated scenes), or a folder with a model of your
+    own."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
     camera: Path | None = None

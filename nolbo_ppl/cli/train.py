@@ -22,8 +22,15 @@ def main(args: Sequence[str] | None = None) -> None:
     """Parse the command line and train."""
     import tyro
 
-    summary = run(tyro.cli(TrainConfig, args=args, prog="nolbo train", description=__doc__))
+    config = tyro.cli(TrainConfig, args=args, prog="nolbo train", description=__doc__)
+    summary = run(config)
     sys.stdout.write(json.dumps(dataclasses.asdict(summary), indent=2, default=str) + "\n")
+    if config.photographs is not None:
+        from nolbo_ppl.cli.evaluate import EvaluateConfig, photograph_table, run_photographs
+
+        model = str(config.out / "model")
+        options = EvaluateConfig(config.out / "photographs", model, photographs=config.photographs, pictures=False)
+        sys.stdout.write(photograph_table(run_photographs(options), model) + "\n")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ the fusion network learns to change in it: nothing before any training.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -31,6 +32,9 @@ COCO_LABELS = {
 """Number of each category among COCO's."""
 TRUCK = 7
 """COCO's trucks: what the detector says of a quarter of all vans, kept apart from the cars' evidence."""
+WEAK = -6.0
+"""Regions of which both sources say less than this (log odds) are not weighed: hardly one of them describes an object, and nine
+of ten regions are of this kind."""
 LEAST_LOG = -9.0
 """Log odds and log probabilities below this are as good as none."""
 
@@ -49,6 +53,15 @@ class Evidence:
     """[x0, y0, x1, y1], px of the image; a box of a stride's side at the cell where it says nothing."""
     features: Float[Tensor, "b k f"]
     """Its features there."""
+
+    def at(self, region: Int[Tensor, "b r"]) -> Evidence:
+        """The evidence about some of each image's regions."""
+
+        def chosen(value: Tensor) -> Tensor:
+            index = region.view(*region.shape, *(1,) * (value.dim() - 2))
+            return value.gather(1, index.expand(-1, -1, *value.shape[2:]))
+
+        return Evidence(*(chosen(getattr(self, field.name)) for field in dataclasses.fields(self)))
 
 
 def bin_best(
@@ -135,6 +148,11 @@ class Fused:
 class Fusion(nn.Module):
     """Detector's and scene network's evidence -> objectness, category and box of every region.
 
+    On photographs a region says what the detector says, up to a factor and a shift of its log odds and a factor of its log
+    probabilities: what more was learnt from a few thousand of them ranked detections worse (average precision of COCO .34
+    against .53). On generated scenes, which the detector does not know, a network weighs the two sources. The image itself
+    says which of the two it is.
+
     Args:
         features: channels of the detector's features.
         context: numbers that describe an image as a whole.
@@ -147,6 +165,10 @@ class Fusion(nn.Module):
         self.context = nn.Sequential(nn.LayerNorm(context), nn.Linear(context, 16), nn.LayerNorm(16), nn.Tanh())
         self.feature_norm = nn.LayerNorm(features)
         inputs = (labels + 2) + labels + features + 16 + 2 + 2 + 4 + 1
+        self.domain_norm, self.domain = nn.LayerNorm(context), nn.Linear(context, 1)
+        nn.init.zeros_(self.domain.weight)
+        nn.init.constant_(self.domain.bias, -8.0)
+        self.photograph = nn.Parameter(torch.tensor([1.0, 0.0, 1.0, 0.0]))
         self.slope = nn.Parameter(torch.ones(()))
         self.shift = nn.Parameter(torch.zeros(()))
         self.sizes = (1, labels, 3, 1, 4, 4)
@@ -155,8 +177,18 @@ class Fusion(nn.Module):
         nn.init.zeros_(last.bias)
         self.weigh = nn.Sequential(nn.Linear(inputs, 96), nn.GELU(), nn.Linear(96, 64), nn.GELU(), last)
 
-    def forward(self, detector: Evidence, scene: Evidence, context: Float[Tensor, "b c"], columns: int) -> Fused:
-        """Weigh the evidence about every region of a batch of images, `columns` cells wide."""
+    def forward(
+        self, detector: Evidence, scene: Evidence, context: Float[Tensor, "b c"], cell: Int[Tensor, "b k"], columns: int
+    ) -> Fused:
+        """Weigh the evidence about regions of a batch of images.
+
+        Args:
+            detector: evidence of the detector.
+            scene: evidence of the scene network, about the same regions.
+            context: what describes each image as a whole.
+            cell: the cell of each region.
+            columns: cells side by side.
+        """
         config = self.config
         inputs = torch.cat(
             (
@@ -169,19 +201,28 @@ class Fusion(nn.Module):
         )  # fmt: skip
         objectness, label, weight, mix, shift, scale = self.weigh(inputs).split(self.sizes, -1)
         labels = len(config.categories)
-        cell = torch.arange(detector.found.shape[1]) // config.predictors
-        cell = cell.expand(len(detector.found), -1)
-        share = torch.where(
-            scene.found[..., None] == 0, 1.0, torch.where(detector.found[..., None] == 0, 0.0, torch.sigmoid(mix + 3.0))
-        )
+        generated = self.generated(context)[:, None]
+        share = torch.lerp(torch.ones_like(mix), torch.sigmoid(mix + 3.0), generated[..., None])
+        alone = torch.where((detector.found == 0) & (scene.found > 0), 0.0, 1.0)  # the box of the only source that has one
+        share = torch.where((detector.found * scene.found > 0)[..., None], share, alone[..., None])
         box = torch.lerp(encode_box(scene.box, cell, columns, config), encode_box(detector.box, cell, columns, config), share)
+        strength = torch.maximum(detector.log_odds, scene.log_odds)
+        weighed = self.slope * detector.log_odds + self.shift + objectness[..., 0]
+        factor, offset, label_factor, look = self.photograph
+        plain = factor * detector.log_odds + offset
+        own = detector.labels[..., :labels]
+        mixed = (1 + weight[..., :1]) * own + weight[..., 1:2] * scene.labels + label
         return Fused(
-            self.slope * detector.log_odds + self.shift + objectness[..., 0],
-            (1 + weight[..., :1]) * detector.labels[..., :labels] + weight[..., 1:2] * scene.labels + label,
-            torch.tanh(weight[..., 2]),
-            box + 0.3 * shift,
+            torch.where(strength > WEAK, torch.lerp(plain, weighed, generated), strength),
+            torch.lerp(label_factor * own, mixed, generated[..., None]),
+            torch.lerp(look.expand_as(weight[..., 2]), torch.tanh(weight[..., 2]), generated),
+            box + 0.3 * shift * generated[..., None],
             scale,
         )
+
+    def generated(self, context: Float[Tensor, "b c"]) -> Float[Tensor, " b"]:
+        """Probability that an image is a generated scene, not a photograph."""
+        return torch.sigmoid(self.domain(self.domain_norm(context)))[:, 0]
 
 
 def _log_size(box: Float[Tensor, "b k 4"]) -> Float[Tensor, "b k 2"]:

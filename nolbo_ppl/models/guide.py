@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from pyro import poutine
 from torch import Tensor, nn
 
@@ -24,7 +24,7 @@ from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.pyro_parameters import declare_parameters
-from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
+from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_centre, cell_of, decode_box, encode_box, encode_range
 
 
 def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> dist.TorchDistribution:
@@ -145,6 +145,7 @@ class Guide(nn.Module):
                     self.config,
                 ),
                 has_range=has_range,
+                counted=known_cells(batch, encoding.rows, columns, self.config, is_object[:, :regions]),
             )
         posterior = self._posterior(_select(raw, predictor), encoding, cell, assigned)
         return ObservedScene(batch, encoding, assignment, posterior)
@@ -244,6 +245,27 @@ def _certain(index: Int[Tensor, "b m"], like: Float[Tensor, "*l b m n"]) -> Floa
 def _select(raw: Float[Tensor, "b m p o"], predictor: Int[Tensor, "b m"]) -> Float[Tensor, "b m o"]:
     index = predictor[..., None, None].expand(-1, -1, 1, raw.shape[-1])
     return torch.gather(raw, 2, index).squeeze(2)
+
+
+def known_cells(
+    batch: SceneBatch, rows: int, columns: int, config: ModelConfig, is_object: Bool[Tensor, "b k"]
+) -> Bool[Tensor, "b k"] | None:
+    """Regions of which it is known whether they describe an object; None where everything is labelled.
+
+    Unknown are cells whose centre lies in a part of the image that is not labelled, and all cells of an image of which some
+    category is not labelled exhaustively, unless they are responsible for an object.
+    """
+    if batch.ignore is None and batch.exhaustive is None:
+        return None
+    known = torch.ones_like(is_object)
+    if batch.ignore is not None:
+        centre = cell_centre(torch.arange(rows * columns), columns, config.stride, batch.ignore.dtype)
+        box = batch.ignore[:, None]
+        inside = (centre[:, None] > box[..., :2]).all(-1) & (centre[:, None] < box[..., 2:]).all(-1)
+        known &= ~inside.any(-1).repeat_interleave(config.predictors, 1)
+    if batch.exhaustive is not None:
+        known &= batch.exhaustive.all(1)[:, None]
+    return known | is_object
 
 
 def assign_predictors(

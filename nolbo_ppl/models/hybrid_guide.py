@@ -17,7 +17,7 @@ from torch import Tensor
 from nolbo_ppl.geometry.boxes import box_area, box_iou
 from nolbo_ppl.models.backbones import check_image, normalise_image
 from nolbo_ppl.models.crops import SIDE, cut_out, image_levels, range_shift
-from nolbo_ppl.models.evidence import ROLE_SIDE, Fused, Fusion, detector_evidence, gather_evidence
+from nolbo_ppl.models.evidence import ROLE_SIDE, Evidence, Fused, Fusion, detector_evidence, gather_evidence
 from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
@@ -44,6 +44,22 @@ class HybridEncoding(Encoding):
     """The normalised images at falling sizes, which objects are cut out of."""
 
 
+@dataclass
+class GatheredEvidence:
+    """What detector and scene network say of a batch of images, before it is weighed."""
+
+    detector: Evidence
+    scene: Evidence
+    context: Float[Tensor, "b c"]
+    """What describes each image as a whole: mean features of both networks."""
+    features: Float[Tensor, "b cells c"]
+    """Features of the scene network's cells."""
+    rows: int
+    columns: int
+    levels: tuple[Float[Tensor, "b 3 _ _"], ...]
+    """See `HybridEncoding`."""
+
+
 class HybridGuide(Guide):
     """Guide with a detector beside its encoder; see the module's docstring."""
 
@@ -63,7 +79,7 @@ class HybridGuide(Guide):
                 module.eval()
         return self
 
-    def encode(self, image: Tensor) -> HybridEncoding:
+    def gather(self, image: Tensor) -> GatheredEvidence:
         """Run detector and scene network on whole images, uint8 or float in 0..255, sides multiples of 32.
 
         Raises:
@@ -80,21 +96,29 @@ class HybridGuide(Guide):
             maps, _ = self.encoder(levels[1].contiguous(memory_format=torch.channels_last))
             features = maps.flatten(2).transpose(1, 2)
             raw = self.head(features)
-            scene_logit = self.head.objectness(features)
-        raw, scene_logit = raw.to(dtype), scene_logit.to(dtype)
-        detector = detector_evidence(predictions, rows, columns, config)
+            logit = self.head.objectness(features)
+        raw, logit = raw.to(dtype), logit.to(dtype)
         cell = torch.arange(raw.shape[1])[:, None].expand(-1, config.predictors)
-        scene_box = REDUCTION * decode_box(self.head.box_latent(raw), cell, maps.shape[3], config)
-        labels = torch.log_softmax(raw[..., : self.head.sizes[0]], -1)
-        scene = gather_evidence(
-            scene_box.flatten(1, 2), scene_logit.flatten(1), labels.flatten(1, 2), scene_logit.new_zeros(*scene_box.shape[:1],
-            scene_box.shape[1] * config.predictors, 0), rows, columns, config,
-        )  # fmt: skip
-        context = torch.cat((features.mean(1).to(dtype), predictions.features.mean(1)), -1)
-        fused = self.fusion(detector, scene, context, columns)
-        region = torch.arange(rows * columns * config.predictors)
-        box = decode_box(fused.box_loc, (region // config.predictors).expand(len(image), -1), columns, config)
-        return HybridEncoding(features, fused.objectness_logit, rows, columns, (), fused, box, levels)
+        box = REDUCTION * decode_box(self.head.box_latent(raw), cell, maps.shape[3], config).flatten(1, 2)
+        labels = torch.log_softmax(raw[..., : self.head.sizes[0]], -1).flatten(1, 2)
+        nothing = labels.new_zeros(*labels.shape[:2], 0)
+        return GatheredEvidence(
+            detector_evidence(predictions, rows, columns, config),
+            gather_evidence(box, logit.flatten(1), labels, nothing, rows, columns, config),
+            torch.cat((features.mean(1).to(dtype), predictions.features.mean(1)), -1),
+            features,
+            rows,
+            columns,
+            levels,
+        )
+
+    def encode(self, image: Tensor) -> HybridEncoding:
+        """Gather the evidence of whole images and weigh it; see `gather`."""
+        one = self.gather(image)
+        cell = torch.arange(one.rows * one.columns).repeat_interleave(self.config.predictors).expand(len(image), -1)
+        fused = self.fusion(one.detector, one.scene, one.context, cell, one.columns)
+        box = decode_box(fused.box_loc, cell, one.columns, self.config)
+        return HybridEncoding(one.features, fused.objectness_logit, one.rows, one.columns, (), fused, box, one.levels)
 
     def parameters_at(
         self,
@@ -127,18 +151,26 @@ class HybridGuide(Guide):
         if not look or len(row) == 0:
             start = self.head.get_buffer("start")[-1].to(dtype).expand(len(row), -1)
             return torch.cat((labels, start[:, label_size:first], located, start[:, first + box_size :]), -1)
+        raw, factor = self.look_at(encoding.levels, row, encoding.box[row, region] if box is None else box)
+        shift = range_shift(factor, self.config.range_spread[0])
+        ranges = torch.cat((raw[:, first + box_size :][:, :1] + shift[:, None], raw[:, first + box_size + 1 :]), -1)
+        seen = fused.look_weight[row, region][:, None] * torch.log_softmax(raw[:, :label_size], -1)
+        return torch.cat((labels + seen, raw[:, label_size:first], located, ranges), -1)
+
+    def look_at(
+        self, levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
+    ) -> tuple[Float[Tensor, "n outputs"], Float[Tensor, " n"]]:
+        """Raw outputs of the second look at boxes, px, cut out of images, and pixels of each crop over those of its image."""
+        dtype = self.head.objectness.weight.dtype
         with torch.no_grad():
-            crops = cut_out(encoding.levels, row, (encoding.box[row, region] if box is None else box).detach())
+            crops = cut_out(levels, row, box.detach())
         number, cells = torch.arange(len(row)), SIDE // self.config.stride
         cell = torch.full_like(number, (cells * cells) // 2)
         with self._autocast():
             maps, fine = self.encoder(crops.image)
             raw = self.head(maps[:, :, cells // 2, cells // 2])[:, -1]
             raw = self.head.refine(raw.to(dtype), fine, number, cell, cells, crops.box).to(dtype)
-        shift = range_shift(crops.factor, self.config.range_spread[0])
-        ranges = torch.cat((raw[:, first + box_size :][:, :1] + shift[:, None], raw[:, first + box_size + 1 :]), -1)
-        seen = fused.look_weight[row, region][:, None] * torch.log_softmax(raw[:, :label_size], -1)
-        return torch.cat((labels + seen, raw[:, label_size:first], located, ranges), -1)
+        return raw, crops.factor
 
     def responsible_region(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
         """Region that describes each box best: the largest overlap, the likelier of like ones."""

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import torch.distributed as distributed
+from jaxtyping import Bool
 
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.dataset_folder import SceneFolder
@@ -196,6 +198,27 @@ class TrainingData:
                     noise=seeded_noise(0, first, *batch.present.shape, self.model.latent_dim),
                     decode_order=seeded_noise(0, first + DECODE_STREAM, *batch.present.shape),
                 )
+
+    def plain_generated(self, most: int) -> Bool[torch.Tensor, " n"]:
+        """Which training scenes of `plain` are generated ones, in its order."""
+        sizes = [len(scenes) for scenes, _, _ in self._mix] or [len(self.train)]
+        kinds = [False] * len(self.config.scenes) + [True] * self.config.generated
+        return torch.tensor([kind for kind, size in zip(kinds, sizes) for _ in range(min(most, size))])
+
+    def plain(self, held_out: bool, most: int) -> Iterator[SceneBatch]:
+        """Scenes of every data set of a mix as they are, at most so many of each, evenly spread over it.
+
+        Args:
+            held_out: those that are not trained on.
+            most: scenes of a data set at most.
+        """
+        train = self._mix or [(self.train, self.table, 0)]
+        parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
+        for scenes, table in parts if held_out else [(scenes, table) for scenes, table, _ in train]:
+            supply = SceneSupply(scenes, table, 16, 0, self.model.latent_dim, size=self.model.image_size)
+            chosen = np.unique(np.linspace(0, len(scenes) - 1, min(most, len(scenes))).round().astype(int))
+            for first in range(0, len(chosen), 16):
+                yield supply.prepared(chosen[first : first + 16])
 
     def teach(self, model: Nolbo) -> None:
         """Encode the shapes by the trained shape guide, in full precision."""

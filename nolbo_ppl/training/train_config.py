@@ -21,9 +21,20 @@ from nolbo_ppl.training.stages import TrainingStage, scene_weights
 
 DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
 """Where rendered scenes are kept between runs."""
-FREE_FIELDS = ("out", "cache", "threads", "workers", "log_every", "checkpoint_every", "tensorboard", "resume", "evaluate_every")
+FREE_FIELDS = (
+    "out",
+    "photographs",
+    "cache",
+    "threads",
+    "workers",
+    "log_every",
+    "checkpoint_every",
+    "tensorboard",
+    "resume",
+    "evaluate_every",
+)
 """Fields a resumed run may change: they do not touch what is learnt."""
-OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes")
+OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes", "evidence_scenes")
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
@@ -127,6 +138,10 @@ class TrainConfig:
     """Steps between looks at the held-out scenes."""
     evaluate_scenes: int = 512
     """Held-out scenes of each look; the calibration at the end uses all."""
+    photographs: Path | None = None
+    """Labelled photographs (COCO-style JSON) that the finished model is measured on, as `nolbo evaluate --photographs` does."""
+    evidence_scenes: int = 1200
+    """Scenes of each data set, at most, from which a model with a detector learns to weigh its evidence at the end."""
     checkpoint_every: int = 100
     """Steps between checkpoints."""
     tensorboard: bool = False

@@ -22,11 +22,14 @@ from nolbo_ppl._version import __version__
 from nolbo_ppl.data.loader import prefetch
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.posterior.model_folder import load, save
+from nolbo_ppl.io.tensors import load_tensors, save_tensors
+from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.training.detector_file import adopt
+from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.stage_data import TrainingData
 from nolbo_ppl.training.stages import StageRun
@@ -98,6 +101,7 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
     )
     if rank == 0:
         model.set_half_precision(False)
+        weighed = weigh_evidence(model, data, config) if model.config.detector else {}
         calibration = Calibration()
         if any(stage.name != "shapes" for stage in stages):
             data.teach(model)
@@ -108,7 +112,7 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
         meta = {
             "calibrated": calibration != Calibration(),
             "training": config.to_json(),
-            "held_out": summary.held_out,
+            "held_out": {**summary.held_out, **weighed},
             "versions": {"nolbo_ppl": __version__, "torch": torch.__version__},
         }
         save(config.out / "model", model, calibration, meta)
@@ -117,6 +121,25 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
         distributed.barrier()
         distributed.destroy_process_group()
     return summary
+
+
+def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dict[str, float]:
+    """The last stage of a model with a detector (`nolbo_ppl.training.evidence_fit`); returns held-out terms."""
+    guide = model.eval().guide
+    assert isinstance(guide, HybridGuide)
+
+    def gathered(held_out: bool) -> EvidenceTable:
+        file = config.out / f"evidence_{'held_out' if held_out else 'train'}.safetensors"
+        if file.is_file():  # a run that is resumed need not gather again
+            return table_of(load_tensors(file)[0])
+        batches = tqdm(data.plain(held_out, config.evidence_scenes), desc="evidence", unit="batch", disable=None)
+        table = join_tables(gather_table(guide, batch) for batch in batches)
+        save_tensors(file, table_tensors(table), {})
+        return table
+
+    train, held_out = gathered(False), gathered(True)
+    terms = fit_fusion(model, train, held_out, data.plain_generated(config.evidence_scenes), config.seed)
+    return {f"evidence/{name}": value for name, value in terms.items()}
 
 
 def _train_stage(

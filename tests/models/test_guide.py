@@ -158,3 +158,24 @@ def test_wrong_images(shape: tuple[int, ...], message: str) -> None:
     model = tiny_model()
     with pytest.raises(InputError, match=message):
         model.guide.encode(torch.zeros(shape, dtype=torch.uint8))
+
+
+def test_what_is_not_labelled_is_not_learnt_as_background() -> None:
+    """Cells in a part to ignore, and all of an image that is not labelled throughout, keep the objects they describe."""
+    model = tiny_model()
+    batch = random_batch(model.config, slots=1)
+    assert model.guide.observe(batch).assignment.counted is None
+    masked = batch.replace(
+        ignore=torch.tensor([[[0.0, 0.0, 33.0, 17.0]], [[0.0, 0.0, 0.0, 0.0]]]),
+        exhaustive=torch.tensor([[True] * 4, [True, False, True, True]]),
+    )
+    where = model.guide.observe(masked).assignment
+    assert where.counted is not None
+    free = ~where.is_object
+    cells = where.counted[0].unflatten(0, (16, 2))[:, 0]
+    expected = torch.ones(16, dtype=torch.bool)
+    expected[:2] = False  # centres at 8 and 24 px of the first row
+    object_cell = int(where.cell[0, 0])
+    expected[object_cell] = cells[object_cell]
+    assert torch.equal(cells, expected)
+    assert not (where.counted[1] & free[1]).any() and where.counted[where.is_object].all()

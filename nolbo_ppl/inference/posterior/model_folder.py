@@ -18,8 +18,8 @@ from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 
 
-def load(name_or_path: str | PathLike[str] = "tiny") -> ObservationModel:
-    """Load a model: the name of weights in the package (`tiny`), or a folder with `model.safetensors` and `config.json`.
+def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
+    """Load a model: the name of weights in the package (`photo`, `tiny`), or a folder with `model.safetensors` and `config.json`.
 
     Raises:
         InputError: neither is there, or the files are damaged or do not fit each other.
