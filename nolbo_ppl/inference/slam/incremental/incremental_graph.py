@@ -214,11 +214,6 @@ class IncrementalGraph:
                 before, after = (number, after) if factor.b == pose else (before, number)
         return before, after
 
-    def neighbour(self, pose: int) -> int | None:
-        """The pose the next step leads to."""
-        after = self.steps_of(pose)[1]
-        return None if after is None else self.factors[after].b
-
     def condense(self, poses: list[int]) -> None:
         """Let the middle one of consecutive poses stand for all of them.
 
