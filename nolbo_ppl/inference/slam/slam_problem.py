@@ -154,11 +154,15 @@ class SlamConfig:
             raise input_error("field_of_view", got=self.field_of_view, expected="two angles above 0 and at most 2 pi")
 
 
+STEP_SCALE_LIMITS = (1e-12, 1e6)
+"""Least and largest standard deviation of an odometry step, rad and m: beyond, squares leave what 64 bits resolve."""
+
+
 def check_step_covariance(covariance: np.ndarray, steps: int) -> None:
     """Refuse covariances of odometry steps that no graph can use.
 
     Raises:
-        InputError: a wrong shape, or a row that is not finite, not symmetric, or not positive definite.
+        InputError: a wrong shape, or a row that is not finite, not symmetric, not positive definite, or out of range.
     """
     if covariance.shape != (steps, 6, 6):
         raise input_error(
@@ -179,6 +183,16 @@ def check_step_covariance(covariance: np.ndarray, steps: int) -> None:
         if not good.all():
             row = int(np.argmin(good))
             raise input_error(f"odometry covariance of step {row} (rows {row} to {row + 1}) is not {what}", got=covariance[row])
+    low, high = STEP_SCALE_LIMITS
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    outside = ((variance < low**2) | (variance > high**2)).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise input_error(
+            f"odometry covariance of step {row} (rows {row} to {row + 1}) is out of range",
+            got=variance[row],
+            expected=f"standard deviations from {low:g} to {high:g} rad and m",
+        )
 
 
 @dataclass(frozen=True)

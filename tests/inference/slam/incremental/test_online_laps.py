@@ -68,6 +68,11 @@ def test_the_trajectory_is_corrected_while_driving(
     drive, slam, infos, _ = driven
     before = absolute_trajectory_error(drive.odometry, drive.truth).rmse
     assert absolute_trajectory_error(slam.trajectory(), drive.truth).rmse < 0.3 * before
+    # Frames of forgotten keyframes hang on one of the same place, not on what is far away by now.
+    graph = slam.graph
+    gone = [t for t in graph.attached if t not in range(slam.frames - 30, slam.frames)]
+    far = [np.linalg.norm(graph.attached[t][1][:3, 3]) for t in gone]
+    assert len(gone) > PER_LAP and max(far) < 25.0
     now = infos[-1].T_world_camera[:3, 3]
     assert np.linalg.norm(now - drive.truth[-1, :3, 3]) < 0.5
 
@@ -128,3 +133,20 @@ def test_keyframe_settings_are_checked() -> None:
     for bad in ({"window": 3}, {"stretch": 0}, {"passes": True}, {"least_met": 1.5}):
         with pytest.raises(InputError):
             KeyframeConfig(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("variance", [1e300, 1e-300, 0.0, np.nan, -1.0])
+def test_odd_covariances_are_refused(variance: float) -> None:
+    slam = IncrementalSlam(CONFIG)
+    slam.update(np.eye(4), empty_table())
+    with pytest.raises(InputError, match="odometry covariance of step 0"):
+        slam.update(np.eye(4), empty_table(), variance * np.eye(6))
+    assert slam.update(np.eye(4), empty_table(), 1e-4 * np.eye(6)).frame == 1  # nothing was taken by halves
+
+
+def test_covariances_for_all_steps_or_for_none() -> None:
+    slam = IncrementalSlam(CONFIG)
+    slam.update(np.eye(4), empty_table())
+    slam.update(np.eye(4), empty_table(), 1e-4 * np.eye(6))
+    with pytest.raises(InputError, match="some keyframes only"):
+        slam.update(np.eye(4), empty_table())
