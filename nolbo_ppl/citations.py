@@ -66,6 +66,11 @@ def citation(*names: str) -> str:
 
     Raises:
         InputError: an unknown name.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> print(nolbo_ppl.citation("pyro").splitlines()[0])
+        @article{bingham2019pyro,
     """
     unknown = sorted(set(names) - set(REFERENCES))
     if unknown:

@@ -6,11 +6,27 @@ from os import PathLike
 
 
 class NolboError(Exception):
-    """Base class of every error the library raises on purpose."""
+    """Base class of every error the library raises on purpose.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> try:
+        ...     nolbo_ppl.read_observations("no such file.jsonl")
+        ... except nolbo_ppl.NolboError as error:
+        ...     print(error)
+        no such file.jsonl: no such file
+    """
 
 
 class InputError(NolboError, ValueError):
-    """Input that cannot be used: the message names where it came from, what was got and what was expected."""
+    """Input that cannot be used: the message names where it came from, what was got and what was expected.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> nolbo_ppl.Detections.from_arrays([0], [[1.0, 2.0]])
+        Traceback (most recent call last):
+        nolbo_ppl.errors.InputError: position has the wrong shape: got (1, 2), expected (1, 3)
+    """
 
 
 def located(error: InputError, file: str | PathLike[str]) -> InputError:

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "nolbo_ppl"
 
 LAYERS = (
-    ("errors", "_version", "_moved", "categories", "citations", "parallel"),
+    ("errors", "_version", "_moved", "categories", "citations", "parallel", "progress"),
     ("geometry",),
     ("structures",),
     ("io",),

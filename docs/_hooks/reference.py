@@ -1,4 +1,4 @@
-"""Reference pages from docstrings, one a package, and the help of every command; new modules appear by themselves."""
+"""Reference pages from docstrings: the public names first, the help of every command, then all modules, a page a package."""
 
 from __future__ import annotations
 
@@ -76,9 +76,23 @@ def help_of(verb: str) -> str:
     return "\n".join(lines)
 
 
+def public_page() -> str:
+    """The public names, in the order of `nolbo_ppl.PUBLIC`."""
+    parts = [
+        "# Public interface",
+        "These names are imported from `nolbo_ppl` itself. They stay, and change only with a warning for a release; every other "
+        "module is an internal that may change. Each has an example, which the tests run.",
+    ]
+    for name, place in importlib.import_module("nolbo_ppl").PUBLIC.items():
+        module, _, attribute = place.partition(":")
+        identifier = f"nolbo_ppl.{module}.{attribute}" if attribute else "nolbo_ppl.training.trainer.run"
+        parts += [f"## nolbo_ppl.{name}", f"::: {identifier}"]
+    return "\n\n".join(parts) + "\n"
+
+
 def pages() -> dict[str, str]:
     """Address and text of every page made here."""
-    made = {"reference/commands.md": command_page()}
+    made = {"reference/public.md": public_page(), "reference/commands.md": command_page()}
     for package in packages():
         name = "_".join(package.relative_to(ROOT).parts[1:]) or "nolbo_ppl"
         made[f"reference/{name}.md"] = package_page(package)
@@ -87,10 +101,15 @@ def pages() -> dict[str, str]:
 
 def on_config(config: Any, **_: Any) -> Any:
     """Fill the Reference section of the navigation."""
-    entries: list[dict[str, str]] = [{"Commands": "reference/commands.md"}]
+    internals: list[dict[str, str]] = []
     for package in packages():
         name = "_".join(package.relative_to(ROOT).parts[1:]) or "nolbo_ppl"
-        entries.append({".".join(package.relative_to(ROOT).parts): f"reference/{name}.md"})
+        internals.append({".".join(package.relative_to(ROOT).parts): f"reference/{name}.md"})
+    entries: list[dict[str, Any]] = [
+        {"Public interface": "reference/public.md"},
+        {"Commands": "reference/commands.md"},
+        {"Internals (may change)": internals},
+    ]
     for section in config.nav:
         if "Reference" in section:
             section["Reference"] = entries

@@ -9,9 +9,11 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import copy_context
 
 from nolbo_ppl._version import __version__
 from nolbo_ppl.errors import NolboError
+from nolbo_ppl.progress import show_progress
 
 VERBS = {
     "demo": "a small drive, from its images to a map with a report",
@@ -55,9 +57,11 @@ def main(args: Sequence[str] | None = None) -> None:
     if args[0] not in VERBS:
         print(f"nolbo: unknown verb {args[0]!r}\n\n{usage()}", file=sys.stderr)
         raise SystemExit(2)
+    shown = copy_context()
+    shown.run(show_progress)
     with _signals():
         try:
-            importlib.import_module(f"nolbo_ppl.cli.{args[0]}").main(args[1:])
+            shown.run(importlib.import_module(f"nolbo_ppl.cli.{args[0]}").main, args[1:])
             sys.stdout.flush()
         except NolboError as error:
             raise _end(args[0], str(error), 2) from None

@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 import tyro
-from tqdm import tqdm
 
 from nolbo_ppl._version import __version__
 from nolbo_ppl.data.dataset_folder import SceneFolder
@@ -32,6 +31,7 @@ from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 
@@ -41,7 +41,13 @@ SEED = 9001
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Evaluate a model on scenes it has not seen and write figures, plots and examples."""
+    """Evaluate a model on scenes it has not seen and write figures, plots and examples.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> nolbo_ppl.EvaluateConfig("figures", model="tiny", count=200).threshold
+        0.01
+    """
 
     out: Path
     """Folder for metrics.json and the pictures."""
@@ -116,7 +122,7 @@ def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
             raise input_error("a folder of scenes and what to generate others from", do="drop --cad, --backgrounds")
         folder = SceneFolder(config.scenes, categories, size=model_config.image_size, symmetry=model_config.symmetry)
         return FolderScenes(folder, config.count)
-    return GeneratedScenes(open_source(config, model_config), config.count, categories)
+    return GeneratedScenes(open_source(config, model_config), config.count)
 
 
 def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSource:
@@ -155,7 +161,7 @@ def measure(config: EvaluateConfig, model: ObservationModel | MultiScalePredicto
     """
     objects: list[ObjectRecords] = []
     boxes, labels, counts, answers, regions = [], [], [], [], []
-    for start in tqdm(range(0, len(scenes), config.batch), desc="evaluating", unit="batch", disable=None):
+    for start in progress_bar(range(0, len(scenes), config.batch), "evaluating", "batch"):
         rows = range(start, min(start + config.batch, len(scenes)))
         truth = [scenes[i] for i in rows]
         images, cameras = [scene.image for scene in truth], np.array([scene.intrinsics for scene in truth])
@@ -163,7 +169,7 @@ def measure(config: EvaluateConfig, model: ObservationModel | MultiScalePredicto
         answers += [(one.box, one.objectness, one.class_posterior) for one in found]
         counted = [scene.counts(config.least_side, config.least_visibility) for scene in truth]
         boxes += [scene.box for scene in truth]
-        labels += [scene.category for scene in truth]
+        labels += [scene.labels(model.config.categories) for scene in truth]
         counts += counted
         regions += [scene.ignore for scene in truth]
         used = [k for k, some in enumerate(counted) if some.any()]
@@ -204,7 +210,7 @@ def measure_retrieval(
         raise input_error("instances to find again", got=0, expected="at least two of a category")
     means, scales = [], []
     step = max(1, config.batch // 2)
-    for start in tqdm(range(0, len(instances), step), desc="retrieval", unit="batch", disable=None):
+    for start in progress_bar(range(0, len(instances), step), "retrieval", "batch"):
         pairs = [views.pair(*instance) for instance in instances[start : start + step]]
         flat = [view for pair in pairs for view in pair]
         answers = model.observe_boxes(
@@ -264,7 +270,16 @@ def _number(value: float | None) -> str:
 
 
 def run(config: EvaluateConfig) -> Evaluation:
-    """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`."""
+    """Measure the model and write `metrics.json` and, unless switched off, the pictures and `index.html` into `config.out`.
+
+    Example:
+        >>> import nolbo_ppl, pathlib, tempfile
+        >>> config = nolbo_ppl.EvaluateConfig(
+        ...     pathlib.Path(tempfile.mkdtemp()), count=4, difficulty="easy", resamples=10, pictures=False)
+        >>> evaluation = nolbo_ppl.evaluate(config)
+        >>> evaluation.scenes, 0 <= evaluation.figures["ap50"].value <= 1
+        (4, True)
+    """
     if config.photographs is not None:
         raise input_error("photographs have a run of their own", do="call run_photographs")
     if config.peer:
@@ -325,7 +340,7 @@ def _evaluate_photographs(config: EvaluateConfig, photographs: Path, folder: Pat
         from nolbo_ppl.viz.detection_plots import write_detections
         from nolbo_ppl.viz.evaluation_page import write_page
 
-        scenes, picture = PhotographScenes(evaluation.photos), folder / "detections.png"
+        scenes, picture = PhotographScenes(evaluation.photos, model.config.categories), folder / "detections.png"
         write_detections(evaluation.scores.pooled, scenes, model, picture)
         write_page(values, [picture], folder / "index.html")
     return evaluation

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence
 from nolbo_ppl.data.sequences.opening import open_frames
@@ -19,6 +18,7 @@ from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_in
 from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.files import atomic_path, write_jsonl
 from nolbo_ppl.io.output_folder import output_folder
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 
@@ -98,7 +98,7 @@ def is_result(folder: Path) -> bool:
 
 
 def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel, folder: Path) -> Iterator[dict]:
-    bar = tqdm(total=len(frames), desc="observing", unit="image", disable=None)
+    bar = progress_bar(None, "observing", "image", total=len(frames))
     with bar:
         for first in range(0, len(frames), config.batch):
             part = range(first, min(first + config.batch, len(frames)))

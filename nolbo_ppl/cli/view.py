@@ -11,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from nolbo_ppl.report.run_folder import read_run
+from nolbo_ppl.io.run_folder import read_run
 from nolbo_ppl.report.viewer import build_viewer, viser_module
 from nolbo_ppl.report.viewer_guard import guarded_server
 

@@ -15,7 +15,8 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import read_jsonl
 from nolbo_ppl.io.images import image_size, open_image
 from nolbo_ppl.io.npz import read_voxels
-from nolbo_ppl.io.scenes import SceneRecord, image_field, parse_record
+from nolbo_ppl.io.scenes import image_field, parse_record
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.dataset_writer import SCENES
 from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels
@@ -91,13 +92,13 @@ class SceneFolder:
         if symmetry is not None and len(symmetry) != len(self.categories):
             raise input_error("symmetry", got=len(symmetry), expected=f"one of each of {len(self.categories)} categories")
         self._symmetries = CATEGORY_SYMMETRY if symmetry is None else dict(zip(self.categories, symmetry))
-        self.records: list[SceneRecord] = []
+        self.records: list[Annotations] = []
         self.image_sizes: list[tuple[int, int]] = []
         self._read_lines()
-        found = {thing.instance for record in self.records for thing in record.objects if thing.instance is not None}
+        found = {name for record in self.records for name in record.instance if name is not None}
         self.instances: tuple[str, ...] = tuple(sorted(found)) if instances is None else tuple(instances)
         self._number = {name: number for number, name in enumerate(self.instances)}
-        most = max(len(record.objects) for record in self.records)
+        most = max(len(record) for record in self.records)
         self.slots = max(SLOTS, most) if slots is None else slots
         if most > self.slots:
             raise input_error("more objects in an image than slots", got=most, expected=f"at most {self.slots}")
@@ -136,21 +137,19 @@ class SceneFolder:
             shift = np.array([left, top])
             labels["intrinsics"][row] = record.intrinsics * scale
             labels["intrinsics"][row, 2:] += shift
-            for slot, thing in enumerate(record.objects):
-                at = (row, slot)
-                labels["present"][at] = True
-                labels["box"][at] = thing.box * scale + np.tile(shift, 2)
-                labels["visibility"][at] = thing.visibility
-                labels["symmetry"][at] = thing.symmetry
-                if thing.category is not None:
-                    labels["category"][at] = self.categories.index(thing.category)
-                labels["instance"][at] = self._number.get(thing.instance or "", -1)
-                if thing.R_camera_object is not None:
-                    labels["rotation"][at], labels["has_viewpoint"][at] = thing.R_camera_object, True
-                if thing.position is not None:
-                    labels["position"][at], labels["has_position"][at] = thing.position, True
-                if thing.size is not None:
-                    labels["diagonal"][at], labels["has_size"][at] = thing.size, True
+            at = (row, slice(len(record)))
+            labels["present"][at] = True
+            labels["box"][at] = record.box * scale + np.tile(shift, 2)
+            labels["visibility"][at], labels["symmetry"][at] = record.visibility, record.symmetry
+            labels["category"][at] = record.labels(self.categories)
+            labels["instance"][at] = [self._number.get(name or "", -1) for name in record.instance]
+            for name, mask, values in (
+                ("rotation", "has_viewpoint", record.R_camera_object),
+                ("position", "has_position", record.position),
+                ("diagonal", "has_size", record.diagonal),
+            ):
+                known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+                labels[name][row, : len(record)][known], labels[mask][at] = values[known], known
             for number, box in enumerate(record.ignore):
                 labels["ignore"][row, number] = box * scale + np.tile(shift, 2)
             if record.exhaustive is not None:
@@ -167,14 +166,22 @@ class SceneFolder:
 
     def image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """The image of a row at its own size. Raises `InputError` when it cannot be decoded."""
-        return open_image(self.records[index].image)
+        file = self.records[index].file
+        assert file is not None  # `image_field` has found it
+        return open_image(file)
+
+    def voxels(self, index: int) -> UInt8[np.ndarray, "m bytes"]:
+        """Packed grids of the objects of a row, all zero where one is unknown."""
+        grids = [self._voxels.get(name or "") for name in self.records[index].instance]
+        empty = np.zeros(VOXELS**3 // 8, dtype=np.uint8)
+        return np.array([empty if bits is None else bits for bits in grids], dtype=np.uint8).reshape(len(grids), len(empty))
 
     def intrinsics(self, index: int) -> Float[np.ndarray, " 4"]:
         """Intrinsics of a row at the image's own size."""
         return self.records[index].intrinsics
 
     def batch(self, indices: Sequence[int] | Int[np.ndarray, " b"]) -> Arrays:
-        """The images of these rows, in the layout of `nolbo_ppl.inference.batch.SceneBatch`, as NumPy arrays.
+        """The images of these rows, in the layout of `nolbo_ppl.models.scene_batch.SceneBatch`, as NumPy arrays.
 
         Raises:
             InputError: a row that is not there, or an image that cannot be decoded.
@@ -187,8 +194,8 @@ class SceneFolder:
         voxels = np.zeros((len(index), self.slots, VOXELS**3 // 8), dtype=np.uint8)
         has_voxels = np.zeros((len(index), self.slots), dtype=np.bool_)
         for row, i in enumerate(index):
-            for slot, thing in enumerate(self.records[i].objects):
-                bits = self._voxels.get(thing.instance or "")
+            for slot, name in enumerate(self.records[i].instance):
+                bits = self._voxels.get(name or "")
                 if bits is not None:
                     voxels[row, slot], has_voxels[row, slot] = bits, True
         return assemble(images, labels, voxels, has_voxels)
@@ -197,11 +204,11 @@ class SceneFolder:
         """Number, packed voxels and category of every instance with known voxels and category, by ascending number."""
         found: dict[int, tuple[np.ndarray, int]] = {}
         for record in self.records:
-            for thing in record.objects:
-                bits = self._voxels.get(thing.instance or "")
-                number = self._number.get(thing.instance or "", -1)
-                if bits is not None and number >= 0 and thing.category is not None:
-                    found[number] = (bits, self.categories.index(thing.category))
+            for name, label in zip(record.instance, record.labels(self.categories).tolist()):
+                bits = self._voxels.get(name or "")
+                number = self._number.get(name or "", -1)
+                if bits is not None and number >= 0 and label >= 0:
+                    found[number] = (bits, label)
         order = sorted(found)
         packed = np.array([found[n][0] for n in order], dtype=np.uint8).reshape(len(found), VOXELS**3 // 8)
         category = np.array([found[n][1] for n in order], dtype=np.int64)

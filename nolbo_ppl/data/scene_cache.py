@@ -17,7 +17,6 @@ from typing import Protocol
 
 import numpy as np
 from jaxtyping import Int, UInt8
-from tqdm import tqdm
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
@@ -25,6 +24,7 @@ from nolbo_ppl.io.files import write_json
 from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.io.output_folder import locked
 from nolbo_ppl.parallel import parallel
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.shape_library import BLOCK, VOXELS
 from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered
@@ -117,7 +117,7 @@ def write_cache(cache: str | os.PathLike[str], source: Source, count: int, worke
             write_json(folder / "source.json", {"version": VERSION, "slots": slots, **source.describe()})
             missing = [shard for shard in missing if not (folder / f"shard-{shard:05d}").is_dir()]
             jobs = [(_write_shard, (source, folder, shard, slots)) for shard in missing]
-            with tqdm(total=len(missing) * BLOCK, desc="rendering scenes", unit="scene", disable=None) as bar:
+            with progress_bar(None, "rendering scenes", "scene", total=len(missing) * BLOCK) as bar:
                 for done in parallel(jobs, workers):
                     bar.update(done)
     return CachedScenes(folder, count)

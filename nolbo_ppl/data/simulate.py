@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
+from nolbo_ppl.geometry.pose import R_WORLD_UPRIGHT, chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
 from nolbo_ppl.io.observations import Detections, make_table
 
 
@@ -93,10 +93,6 @@ class SimulatedSequence:
     """True object of each detection, -1 for clutter."""
     world: SimulatedWorld | None = None
     """The objects, where they are known."""
-
-
-# The object frame (z up) in a level camera's world (y down): object x -> world x, z up -> -y, so y -> z.
-R_WORLD_UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def simulate_world(truth: Float[np.ndarray, "n 4 4"], config: WorldConfig, rng: np.random.Generator) -> SimulatedWorld:

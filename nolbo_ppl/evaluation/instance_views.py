@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nolbo_ppl.errors import NolboError
-from nolbo_ppl.evaluation.labelled_scenes import truth_of_rendered
-from nolbo_ppl.evaluation.measure import SceneTruth
+from nolbo_ppl.evaluation.labelled_scenes import annotations_of
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.assets.shape_library import ShapePool
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
@@ -75,7 +75,7 @@ class InstanceViews:
         known: Sequence[str] = [name for name in pool.categories if name in self.categories and pool.count(name) > 1]
         return [(name, number) for name in known for number in range(min(self.most, pool.count(name)))]
 
-    def pair(self, category: str, number: int) -> tuple[SceneTruth, SceneTruth]:
+    def pair(self, category: str, number: int) -> tuple[Annotations, Annotations]:
         """The two views of an instance."""
-        first, second = (truth_of_rendered(render_view(self.source, category, number, view), self.categories) for view in (0, 1))
+        first, second = (annotations_of(render_view(self.source, category, number, view)) for view in (0, 1))
         return first, second

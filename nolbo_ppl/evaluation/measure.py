@@ -7,7 +7,6 @@ region responsible for each ("with ground truth bounding box", NOLBO Table 1).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -23,46 +22,11 @@ from nolbo_ppl.metrics.detection import Matches, match
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_average_precision, voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 CRPS_NODES = 360
 """Nodes on the circle of the ranked probability score: one a degree."""
-
-
-@dataclass(frozen=True)
-class SceneTruth:
-    """One labelled image; a missing label is NaN, or -1 for a category."""
-
-    image: UInt8[np.ndarray, "h w 3"]
-    intrinsics: Float[np.ndarray, " 4"]
-    """[fx, fy, cx, cy], px."""
-    box: Float[np.ndarray, "m 4"]
-    """[x0, y0, x1, y1], px."""
-    category: Int[np.ndarray, " m"]
-    """Label among the model's categories."""
-    R_camera_object: Float[np.ndarray, "m 3 3"]
-    """Egocentric rotation."""
-    position: Float[np.ndarray, "m 3"]
-    """Box centre in the camera frame, m."""
-    symmetry: Int[np.ndarray, " m"]
-    """1 none, n n-fold, 0 free about the vertical axis."""
-    visibility: Float[np.ndarray, " m"]
-    """Visible share."""
-    voxels: UInt8[np.ndarray, "m bytes"]
-    """Canonical grid, packed bits in C order; all zero where it is unknown."""
-    diagonal: Float[np.ndarray, " m"]
-    """Box diagonal, m."""
-    ignore: Float[np.ndarray, "k 4"]
-    """Boxes of parts of the image whose objects are not labelled, px."""
-
-    @property
-    def side(self) -> Float[np.ndarray, " m"]:
-        """Longer side of each box, px."""
-        return np.maximum(self.box[:, 2] - self.box[:, 0], self.box[:, 3] - self.box[:, 1])
-
-    def counts(self, least_side: float = 12.0, least_visibility: float = 0.5) -> Bool[np.ndarray, " m"]:
-        """Objects that count: boxes with a side of at least so many px, and at least so much of the object seen."""
-        return (self.side >= least_side) & (self.visibility >= least_visibility)
 
 
 @runtime_checkable
@@ -80,7 +44,7 @@ class ShapeModel(Protocol):
 
 
 def measure_objects(
-    truth: Sequence[SceneTruth],
+    truth: Sequence[Annotations],
     answers: Sequence[ObjectPosteriors],
     slots: Sequence[Int[np.ndarray, " _"]],
     scenes: Sequence[int],
@@ -107,11 +71,13 @@ def measure_objects(
     def said(name: str) -> np.ndarray:
         return np.concatenate([np.asarray(getattr(one, name), dtype=np.float64) for one in answers])
 
-    category, symmetry, position = true("category"), true("symmetry"), true("position")
+    labels = [scene.labels(answer.categories)[rows] for scene, answer, rows in zip(truth, answers, slots)]
+    category, symmetry, position = np.concatenate(labels), true("symmetry"), true("position")
     R_truth = true("R_camera_object")
     viewpoint = _allocentric(R_truth, _rays(truth, slots))
     orientation = _orientation(viewpoint, symmetry, answers)
-    shape = _shape(true("voxels"), category, said("latent"), said("latent_scale"), model)
+    voxels = np.concatenate([_voxels(scene)[rows] for scene, rows in zip(truth, slots)])
+    shape = _shape(voxels, category, said("latent"), said("latent_scale"), model)
     log_posterior = said("class_log_posterior")
     oriented = np.isfinite(R_truth).all((1, 2))
     error = np.full(len(category), np.nan)
@@ -141,11 +107,18 @@ def measure_objects(
     )
 
 
+def _voxels(scene: Annotations) -> UInt8[np.ndarray, "m bytes"]:
+    """Packed grids of a scene's objects. Raises `InputError` when nobody has looked them up."""
+    if scene.voxels is None:
+        raise input_error("objects without grids", got=scene.file, expected="`voxels`, all zero where one is unknown")
+    return scene.voxels
+
+
 def _wrap(angle: np.ndarray) -> np.ndarray:
     return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
-def _rays(truth: Sequence[SceneTruth], slots: Sequence[np.ndarray]) -> Float[np.ndarray, "n 3"]:
+def _rays(truth: Sequence[Annotations], slots: Sequence[np.ndarray]) -> Float[np.ndarray, "n 3"]:
     """Towards each object's centre where its position is known, else through the middle of its box."""
     rays = []
     for scene, rows in zip(truth, slots):

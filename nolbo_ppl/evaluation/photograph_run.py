@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from tqdm import tqdm
 
 from nolbo_ppl.data.converters.photographs import Photograph, read_photographs
 from nolbo_ppl.data.sequences.image_sequence import read_image
-from nolbo_ppl.evaluation.measure import SceneTruth
 from nolbo_ppl.evaluation.peers import OnnxPeer
 from nolbo_ppl.evaluation.photograph_scores import (
     PhotographAnswer,
@@ -29,6 +27,8 @@ from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics
 from nolbo_ppl.models.distributions import VonMisesMixture
+from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 Model = ObservationModel | MultiScalePredictor
@@ -51,26 +51,24 @@ class PhotographScenes:
     """Photographs as labelled scenes without poses, for the pictures."""
 
     photos: Sequence[Photograph]
+    categories: Sequence[str]
+    """Names that their labels stand for."""
 
     def __len__(self) -> int:
         return len(self.photos)
 
-    def __getitem__(self, index: int) -> SceneTruth:
+    def __getitem__(self, index: int) -> Annotations:
         photo = self.photos[index]
         image = read_image(photo.image)
-        n = int((~photo.ignore).sum())
-        return SceneTruth(
-            image=image,
-            intrinsics=guessed_intrinsics(image),
-            box=photo.box[~photo.ignore],
-            category=photo.category[~photo.ignore],
-            R_camera_object=np.full((n, 3, 3), np.nan),
-            position=np.full((n, 3), np.nan),
-            symmetry=np.ones(n, dtype=np.int64),
-            visibility=np.ones(n),
-            voxels=np.zeros((n, 1), dtype=np.uint8),
-            diagonal=np.full(n, np.nan),
+        labelled = photo.box[~photo.ignore]
+        return Annotations.from_arrays(
+            guessed_intrinsics(image),
+            labelled,
+            category=[self.categories[label] if label >= 0 else None for label in photo.category[~photo.ignore]],
             ignore=photo.box[photo.ignore],
+            voxels=np.zeros((len(labelled), 1), dtype=np.uint8),
+            file=photo.image,
+            pixels=image,
         )
 
 
@@ -130,7 +128,7 @@ def _chunks(
     photos: Sequence[Photograph], batch: int
 ) -> Iterator[tuple[int, Sequence[Photograph], list[UInt8[np.ndarray, "h w 3"]]]]:
     step = 4 * batch
-    for first in tqdm(range(0, len(photos), step), desc="photographs", unit="batch", disable=None):
+    for first in progress_bar(range(0, len(photos), step), "photographs", "batch"):
         chunk = photos[first : first + step]
         yield first, chunk, [read_image(photo.image) for photo in chunk]
 

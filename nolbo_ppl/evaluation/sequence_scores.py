@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from nolbo_ppl.evaluation.sequence_truth import DriveTruth, MatchResult
+from nolbo_ppl.geometry.alignment import known_rows, pose_alignment
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.inference.slam.detection_features import weighted_latents
-from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.calibration import chi_square_mass, coverage
-from nolbo_ppl.metrics.trajectory import known_rows, pose_alignment
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture
+from nolbo_ppl.structures.detections import Detections
 
 RANGES = (0.0, 5.0, 10.0, 20.0, 40.0)
 """Edges of the bands of range position errors are told for, m; the last band is open."""
@@ -101,7 +101,7 @@ def position_figures(
 
 
 def orientation_mass(
-    modes: Sequence[Sequence[Mapping[str, float]]],
+    seen: Detections,
     position: Float[np.ndarray, "k 3"],
     R_camera_object: Float[np.ndarray, "k 3 3"],
     symmetry: Int[np.ndarray, " k"],
@@ -109,18 +109,14 @@ def orientation_mass(
     """Mass of the azimuth posterior's highest-density region that reaches out to the truth.
 
     Args:
-        modes: `azimuth_modes` of each observation: weight, azimuth, concentration.
+        seen: detections, all of which state the modes of their azimuth.
         position: where the object truly is, camera frame: its direction turns egocentric into allocentric.
         R_camera_object: true rotation.
         symmetry: order of the object; the posterior is folded by it.
     """
-    if not len(modes):
+    if not len(seen):
         return np.zeros(0)
-    count = max(len(one) for one in modes)
-    weight, mean, concentration = (np.zeros((len(modes), count)) for _ in range(3))
-    for i, one in enumerate(modes):
-        for j, mode in enumerate(one):
-            weight[i, j], mean[i, j], concentration[i, j] = mode["weight"], mode["azimuth"], mode["concentration"]
+    weight, mean, concentration = (np.nan_to_num(x) for x in (seen.azimuth_weight, seen.azimuth, seen.azimuth_concentration))
     posterior = VonMisesMixture.from_mean_concentration(
         torch.from_numpy(np.log(np.maximum(weight, 1e-300))),
         torch.from_numpy(mean),
@@ -134,7 +130,6 @@ def orientation_mass(
 def coverage_figures(
     matched: MatchResult,
     table: Detections,
-    modes: Sequence[Sequence[Mapping[str, float]] | None],
     truth: DriveTruth,
     model: ShapeModel | None,
 ) -> dict[str, Any]:
@@ -147,10 +142,10 @@ def coverage_figures(
         difference = true["position"][stated] - table.position[stated]
         out["position"] = finite(coverage(chi_square_mass(difference, table.position_covariance[stated])))
     symmetry = truth.symmetry[matched.object]
-    oriented = np.array([k for k in rows.tolist() if modes[k] and symmetry[k] != 0], dtype=np.int64)  # a free axis has no azimuth
+    oriented = rows[table.has_azimuth[rows] & (symmetry[rows] != 0)]  # a free axis has no azimuth
     if len(oriented):
-        known = [modes[k] or () for k in oriented.tolist()]
-        mass = orientation_mass(known, true["position"][oriented], true["rotation"][oriented], symmetry[oriented])
+        seen = table.select(oriented)
+        mass = orientation_mass(seen, true["position"][oriented], true["rotation"][oriented], symmetry[oriented])
         out["orientation"] = finite(coverage(mass))
     shaped = rows[table.has_latent[rows]]
     if model is not None and len(shaped):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,38 +14,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import pairwise_iou
 from nolbo_ppl.metrics.detection import match_image
+from nolbo_ppl.structures.annotations import Annotations
 
-if TYPE_CHECKING:
-    from nolbo_ppl.synthetic.worlds import DriveFrame
-
-LEAST_SIDE = 12.0
-"""Objects whose box is smaller than this, px, need not be found."""
-LEAST_VISIBILITY = 0.5
-"""Objects of which less is seen need not be found."""
 IOU = 0.5
 """Overlap of a detection with the object it is of."""
-
-
-@dataclass(frozen=True)
-class TrueFrame:
-    """Objects seen in one frame."""
-
-    object: Int[np.ndarray, " m"]
-    """Number of each in the drive."""
-    box: Float[np.ndarray, "m 4"]
-    """[x0, y0, x1, y1], px."""
-    position: Float[np.ndarray, "m 3"]
-    """Box centre in the camera frame, m."""
-    R_camera_object: Float[np.ndarray, "m 3 3"]
-    """Egocentric rotation."""
-    visibility: Float[np.ndarray, " m"]
-    """Visible share."""
-
-    @property
-    def counts(self) -> Bool[np.ndarray, " m"]:
-        """Objects that are to be found: large enough, and seen well enough."""
-        side = np.max(self.box[:, 2:] - self.box[:, :2], axis=1, initial=0.0)
-        return (side >= LEAST_SIDE) & (self.visibility >= LEAST_VISIBILITY)
 
 
 @dataclass(frozen=True)
@@ -68,24 +40,25 @@ class DriveTruth:
     """Whether it moves."""
     packed: Mapping[str, UInt8[np.ndarray, " bytes"]]
     """Packed 32^3 grid by instance."""
-    frames: tuple[TrueFrame, ...]
-    """What each keyframe shows."""
+    frames: tuple[Annotations, ...]
+    """What each keyframe shows; every object has one of `names` for its `id`."""
+
+    @cached_property
+    def shown(self) -> tuple[Int[np.ndarray, " _"], ...]:
+        """Number of every object that each keyframe shows, in the order of its annotations."""
+        number = {name: i for i, name in enumerate(self.names)}
+        return tuple(np.array([number[name or ""] for name in frame.id], dtype=np.int64) for frame in self.frames)
 
     def __len__(self) -> int:
         return len(self.names)
 
 
-def _frame(seen: DriveFrame, number: Mapping[str, int], file: Path) -> TrueFrame:
-    n = len(seen.ids)
-    if any(one.position is None or one.R_camera_object is None for one in seen.objects):
-        raise input_error("an object without position or rotation", got=seen.image.name, expected="both", file=file)
-    return TrueFrame(
-        object=np.array([number[name] for name in seen.ids], dtype=np.int64),
-        box=np.array([one.box for one in seen.objects], dtype=np.float64).reshape(n, 4),
-        position=np.array([one.position for one in seen.objects], dtype=np.float64).reshape(n, 3),
-        R_camera_object=np.array([one.R_camera_object for one in seen.objects], dtype=np.float64).reshape(n, 3, 3),
-        visibility=np.array([one.visibility for one in seen.objects], dtype=np.float64),
-    )
+def _with_pose(seen: Annotations, file: Path) -> Annotations:
+    """A frame whose objects all have a position and a rotation."""
+    if not (np.isfinite(seen.position).all() and np.isfinite(seen.R_camera_object).all()):
+        name = None if seen.file is None else seen.file.name
+        raise input_error("an object without position or rotation", got=name, expected="both", file=file)
+    return seen
 
 
 def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
@@ -102,8 +75,7 @@ def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
 
     drive = read_drive(folder)
     things = drive.objects
-    number = {thing.id: i for i, thing in enumerate(things)}
-    by_image = {seen.image.name: seen for seen in drive.frames}
+    by_image = {seen.file.name: seen for seen in drive.frames if seen.file is not None}
     missing = [image for image in images if Path(image).name not in by_image]
     if missing:
         raise input_error("not an image of the drive", got=missing[0], expected=f"one of {len(drive)} images", file=folder)
@@ -120,7 +92,7 @@ def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
         symmetry=np.array([thing.symmetry for thing in things], dtype=np.int64),
         moving=np.array([thing.moving for thing in things], dtype=bool),
         packed=packed,
-        frames=tuple(_frame(by_image[Path(image).name], number, folder) for image in images),
+        frames=tuple(_with_pose(by_image[Path(image).name], folder) for image in images),
     )
 
 
@@ -159,12 +131,12 @@ def object_shown(
     Unlike `match_detections`, two detections may be of one object: whose a detection is does not depend on the others.
     """
     shown = np.full(len(frame), -1)
-    for t, seen in enumerate(truth.frames):
+    for t, (seen, number) in enumerate(zip(truth.frames, truth.shown)):
         rows = np.flatnonzero(frame == t)
-        if len(rows) and len(seen.object):
+        if len(rows) and len(seen):
             overlap = pairwise_iou(torch.from_numpy(box[rows]), torch.from_numpy(seen.box)).numpy()
             best = overlap.argmax(1)
-            shown[rows] = np.where(overlap.max(1) >= least_overlap, seen.object[best], -1)
+            shown[rows] = np.where(overlap.max(1) >= least_overlap, number[best], -1)
     return shown
 
 
@@ -179,11 +151,11 @@ def match_detections(
     object_of, row_of = np.full(len(frame), -1), np.full(len(frame), -1)
     counted = np.zeros(len(frame), dtype=bool)
     found = wanted = 0
-    for t, seen in enumerate(truth.frames):
-        rows, counts = np.flatnonzero(frame == t), seen.counts
+    for t, (seen, number) in enumerate(zip(truth.frames, truth.shown)):
+        rows, counts = np.flatnonzero(frame == t), seen.counts()
         matched = match_image(box[rows], objectness[rows], seen.box, ~counts, iou_threshold)
         hit = matched >= 0
-        object_of[rows[hit]], row_of[rows[hit]] = seen.object[matched[hit]], matched[hit]
+        object_of[rows[hit]], row_of[rows[hit]] = number[matched[hit]], matched[hit]
         counted[rows[hit]] = counts[matched[hit]]
         found += int(counts[matched[hit]].sum())
         wanted += int(counts.sum())

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+R_WORLD_UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""R_world_object of an object that stands upright: its z is up, the world's y points down (x -> x, z -> -y, so y -> z)."""
+
 
 def skew(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
     """Matrix of the cross product, `skew(a) @ b = a x b`."""

@@ -12,51 +12,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.rotation import quaternion_to_matrix
 from nolbo_ppl.io.files import inside
+from nolbo_ppl.structures.annotations import Annotations
 
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may lie from 1."""
 BORDER_TOLERANCE = 1.0
 """How far a box may stick out of its image, px; it is cut to the image."""
-
-
-@dataclass(frozen=True)
-class ObjectRecord:
-    """One labelled object; None where a label is missing."""
-
-    box: Float[np.ndarray, " 4"]
-    category: str | None
-    instance: str | None
-    R_camera_object: Float[np.ndarray, "3 3"] | None
-    position: Float[np.ndarray, " 3"] | None
-    size: float | None
-    visibility: float
-    symmetry: int
-
-
-@dataclass(frozen=True)
-class SceneRecord:
-    """One labelled image."""
-
-    image: Path
-    intrinsics: Float[np.ndarray, " 4"]
-    objects: tuple[ObjectRecord, ...]
-    ignore: Float[np.ndarray, "k 4"]
-    """Boxes of parts of the image whose objects are not labelled: nothing is learnt of them, and what is found there is not
-    judged."""
-    exhaustive: tuple[str, ...] | None = None
-    """Categories of which every instance is labelled; None for all of them."""
 
 
 def _is_number(value: object) -> bool:
@@ -109,7 +80,7 @@ def _parse_rotation(at: _Line, row: dict[str, Any], where: str) -> np.ndarray:
 
 def _parse_object(
     at: _Line, row: object, number: int, width: int, height: int, categories: Sequence[str], symmetries: Mapping[str, int]
-) -> ObjectRecord:
+) -> dict[str, Any]:
     where = f"objects[{number}]."
     if not isinstance(row, dict):
         raise at.error(f"objects[{number}]", row, 'an object such as {"box": [x0, y0, x1, y1]}')
@@ -142,7 +113,18 @@ def _parse_object(
     symmetry = row["symmetry"] if "symmetry" in known else symmetries.get(category or "", 1)
     if isinstance(symmetry, bool) or not isinstance(symmetry, int) or symmetry < 0:
         raise at.error(f"{where}symmetry", symmetry, "0 (free about the vertical axis), 1 (none) or n (n-fold)")
-    return ObjectRecord(box, category, instance, R, position, size, visibility, symmetry)
+    name = row["id"] if "id" in known else None
+    return {
+        "box": box,
+        "category": category,
+        "instance": instance,
+        "id": None if name is None else str(name),
+        "R_camera_object": R,
+        "position": position,
+        "diagonal": size,
+        "visibility": visibility,
+        "symmetry": symmetry,
+    }
 
 
 def parse_record(
@@ -153,8 +135,8 @@ def parse_record(
     image_size: tuple[int, int],
     image: Path,
     symmetries: Mapping[str, int] = CATEGORY_SYMMETRY,
-) -> SceneRecord:
-    """Check one line and turn it into a record.
+) -> Annotations:
+    """Check one line and turn it into the annotations of its image.
 
     Args:
         row: the parsed JSON.
@@ -181,13 +163,12 @@ def parse_record(
     if not isinstance(regions, list):
         raise at.error("ignore", regions, "a list of boxes [x0, y0, x1, y1] in px")
     exhaustive = row.get("exhaustive")
-    if exhaustive is not None:
-        if not isinstance(exhaustive, list) or not all(isinstance(name, str) and name in categories for name in exhaustive):
-            raise at.error("exhaustive", exhaustive, "a list of categories among " + ", ".join(categories))
-        exhaustive = tuple(exhaustive)
+    if exhaustive is not None and not (isinstance(exhaustive, list) and all(name in list(categories) for name in exhaustive)):
+        raise at.error("exhaustive", exhaustive, "a list of categories among " + ", ".join(categories))
     ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
-    regions_ignored = np.array(ignore, dtype=np.float64).reshape(-1, 4)
-    return SceneRecord(image, intrinsics, tuple(parsed), regions_ignored, exhaustive)
+    columns = ("box", "category", "instance", "id", "R_camera_object", "position", "diagonal", "visibility", "symmetry")
+    values: dict[str, Any] = {name: [thing[name] for thing in parsed] for name in columns}
+    return Annotations.from_arrays(intrinsics, **values, ignore=ignore, exhaustive=exhaustive, file=image)
 
 
 def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Path:

@@ -78,6 +78,11 @@ def read_trajectory(
         >>> _ = file.write_text("1403636579763555584,1,2,3,0.6,0.8,0,0\\n")  # q_w first: commas and ns
         >>> read_trajectory(file).T_world_camera[0, 2].round(2).tolist()
         [0.0, 0.96, -0.28, 3.0]
+        >>> import nolbo_ppl, pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "poses.txt"
+        >>> _ = path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\\n1 0 0 0 0 1 0 0 0 0 1 0.5\\n")  # KITTI: rows of 3 x 4 matrices
+        >>> nolbo_ppl.read_trajectory(path).T_world_camera[1, :3, 3]
+        array([0. , 0. , 0.5])
     """
     path = Path(path)
     if path.is_dir():

@@ -74,6 +74,14 @@ class GenerativeModel(nn.Module):
 
     A torch module whose forward makes Pyro statements, of its parameters too (`declare_parameters`): an optimiser of
     Pyro's finds them, and they never enter Pyro's global store.
+
+    Example:
+        >>> import nolbo_ppl, torch
+        >>> from nolbo_ppl.models.model_config import nano
+        >>> config = nano()
+        >>> model = nolbo_ppl.GenerativeModel(config)
+        >>> model.prior.label_mean().shape == (len(config.categories), config.latent_dim)  # mu_psi(l) of every category
+        True
     """
 
     def __init__(self, config: ModelConfig) -> None:

@@ -50,6 +50,15 @@ class Guide(nn.Module):
     A region is responsible for one object: where a cell holds more objects than predictors, those of the worst overlap
     find none. Their regions count as background and their other terms are masked (`ObservedScene.left_out`; validation
     reports their share).
+
+    Example:
+        >>> import nolbo_ppl, torch
+        >>> from nolbo_ppl.models.model_config import nano
+        >>> config = nano()
+        >>> guide = nolbo_ppl.Guide(config, nolbo_ppl.GenerativeModel(config).prior)
+        >>> encoding = guide.encode(torch.zeros(1, 3, 64, 96, dtype=torch.uint8))
+        >>> encoding.objectness_logit.shape == (1, (64 // config.stride) * (96 // config.stride) * config.predictors)  # regions
+        True
     """
 
     def __init__(self, config: ModelConfig, prior: LabelPrior) -> None:

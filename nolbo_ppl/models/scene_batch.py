@@ -16,7 +16,22 @@ from nolbo_ppl.models.model_config import ModelConfig
 
 @dataclass
 class SceneBatch:
-    """B scenes with M padded object slots each; labels that are missing are masked or enumerated, never guessed."""
+    """B scenes with M padded object slots each; labels that are missing are masked or enumerated, never guessed.
+
+    Example:
+        >>> import nolbo_ppl, torch
+        >>> none, some = torch.zeros(2, 1, dtype=torch.bool), torch.ones(2, 1, dtype=torch.bool)
+        >>> scenes = nolbo_ppl.SceneBatch(  # two images with a box each; nothing else is known
+        ...     image=torch.zeros(2, 3, 64, 64, dtype=torch.uint8), intrinsics=torch.tensor([[60.0, 60, 32, 32]]).repeat(2, 1),
+        ...     present=some, box=torch.tensor([[[10.0, 10.0, 40.0, 50.0]]]).repeat(2, 1, 1), category=torch.full((2, 1), -1),
+        ...     instance=torch.full((2, 1), -1), viewpoint=torch.zeros(2, 1, 3), has_viewpoint=none,
+        ...     symmetry=torch.ones(2, 1, dtype=torch.int64), position=torch.zeros(2, 1, 3), has_position=none,
+        ...     diagonal=torch.ones(2, 1), has_size=none, visibility=torch.ones(2, 1),
+        ...     voxels=torch.zeros(2, 1, 32**3 // 8, dtype=torch.uint8), has_voxels=none,
+        ... )
+        >>> scenes[:1].image.shape
+        torch.Size([1, 3, 64, 64])
+    """
 
     image: UInt8[Tensor, "b 3 h w"]
     """Colours 0..255."""

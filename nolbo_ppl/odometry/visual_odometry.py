@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -16,6 +15,7 @@ from nolbo_ppl.odometry.ground_scale import LengthBelief, fit_ground, next_lengt
 from nolbo_ppl.odometry.keypoints import Features, detect, grey, match, track
 from nolbo_ppl.odometry.odometry_config import GroundHeight, KnownLengths, OdometryConfig, Scale, StepFlag
 from nolbo_ppl.odometry.pure_rotation import parallax_share, rotation_only
+from nolbo_ppl.progress import progress_bar
 
 ROTATION_FLOOR, TRANSLATION_FLOOR = 1e-5, 1e-4
 """Least standard deviations of a step, rad and m: a covariance is never singular."""
@@ -288,6 +288,18 @@ def estimate_odometry(
 
     Raises:
         InputError: no frame, lengths that do not fit, images that differ in size.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> from nolbo_ppl.odometry import KnownLengths
+        >>> texture = np.kron(np.random.default_rng(0).integers(0, 256, (40, 60, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+        >>> class Sideways:  # any sequence with a length and `frame(k)`
+        ...     def __len__(self): return 3
+        ...     def frame(self, k): return texture[:, 4 * k : 4 * k + 200]
+        >>> lengths = KnownLengths(np.array([0.1, 0.1]))
+        >>> found = nolbo_ppl.estimate_odometry(Sideways(), np.array([150.0, 150.0, 100.0, 80.0]), lengths)
+        >>> found.T_world_camera.shape
+        (3, 4, 4)
     """
     setup = VisualOdometry(np.asarray(intrinsics), scale, config or OdometryConfig())
     if len(frames) == 0:
@@ -300,12 +312,7 @@ def estimate_odometry(
         )
     state = init(setup, frames.frame(0))
     steps: list[Step] = []
-    numbers: Iterable[int] = range(1, len(frames))
-    if progress:
-        from tqdm import tqdm
-
-        numbers = tqdm(numbers, total=len(frames) - 1, desc="odometry", unit="frame", disable=None)
-    for k in numbers:
+    for k in progress_bar(range(1, len(frames)), "odometry", "frame", shown=progress):
         state, taken = step(setup, state, frames.frame(k))
         steps.append(taken)
     return Odometry(

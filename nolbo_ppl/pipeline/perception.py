@@ -1,18 +1,19 @@
-"""The guide on every keyframe: the lines of `observations.jsonl`, positions refined where depth is at hand."""
+"""The guide on every keyframe: detections of a sequence, positions refined where depth is at hand."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from tqdm import tqdm
 
 from nolbo_ppl.data.sequences import FrameSequence
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.pipeline.depth_refinement import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
+from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 STRUCTURED_LIGHT = 0.0015
@@ -104,25 +105,28 @@ def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Pa
     return [files[i] for i in index]
 
 
-def observed_rows(
+def observe_sequence(
     observe: Observe,
     read: Callable[[int], Picture],
     names: Sequence[str],
     intrinsics: Float[np.ndarray, " 4"],
     depth: DepthSource,
     batch: int,
-) -> Iterator[dict[str, Any]]:
-    """Lines of `observations.jsonl`, batch by batch, with a progress bar on a terminal.
+    times: Sequence[float | None] = (),
+) -> Detections:
+    """Detections of every keyframe.
 
     Args:
-        observe: observations of each of some images of one camera.
+        observe: posteriors of each of some images of one camera.
         read: image of a keyframe.
         names: what each keyframe's image is called.
         intrinsics: [fx, fy, cx, cy], px.
         depth: refines positions where it is known.
         batch: images in memory at once.
+        times: seconds of each keyframe; none where nobody knows them.
     """
-    with tqdm(total=len(names), desc="observing", unit="image", disable=None) as bar:
+    tables = []
+    with progress_bar(None, "observing", "image", total=len(names)) as bar:
         for first in range(0, len(names), batch):
             frames = range(first, min(first + batch, len(names)))
             images = [read(k) for k in frames]
@@ -130,5 +134,6 @@ def observed_rows(
                 known = depth.depth(k, image)
                 if known is not None:
                     observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
-                yield from observed.rows(k, names[k])
+                tables.append(observed.detections(k, names[k], times[k] if times else None))
             bar.update(len(frames))
+    return Detections.concatenate(tables)

@@ -1,4 +1,4 @@
-"""Options of a run."""
+"""Options of a run, each with the first stage whose result it changes (`stage_keys`)."""
 
 from __future__ import annotations
 
@@ -8,68 +8,76 @@ from pathlib import Path
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.odometry import OdometryConfig
+from nolbo_ppl.pipeline.stage_keys import affects
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """From images to a corrected trajectory, a map of objects with shapes, figures and a report."""
+    """From images to a corrected trajectory, a map of objects with shapes, figures and a report.
 
-    images: Path
+    Example:
+        >>> import nolbo_ppl
+        >>> config = nolbo_ppl.RunConfig("drive/images", "run", intrinsics="drive/intrinsics.json", camera_height=1.5)
+        >>> config.threshold
+        0.6
+    """
+
+    images: Path = field(metadata=affects("odometry", "images"))
     """Folder of images (plain, KITTI or TUM), or a video file."""
-    out: Path
+    out: Path = field(metadata=affects(None))
     """Folder of the run. Stages that are complete in it are not done again."""
-    intrinsics: Path | None = None
+    intrinsics: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, JSON with fx, fy, cx, cy in px of the images, a KITTI calib.txt, or
     numbers. Its distortion is taken out of the images. Without a file the camera is guessed, which makes ranges wrong."""
-    odometry: Path | None = None
+    odometry: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """Odometry of every image, T_world_camera (KITTI or TUM rows); without it visual odometry is run."""
-    truth: Path | None = None
+    truth: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """True trajectory, for errors, and for the lengths of visual odometry where nothing else gives them."""
-    truth_objects: Path | None = None
+    truth_objects: Path | None = field(default=None, metadata=affects("figures", "drive"))
     """Folder of a drive (`nolbo drive`), for figures against its true objects."""
-    model: str = "tiny"
+    model: str = field(default="tiny", metadata=affects("observe", "model"))
     """Observation model: name of weights in the package, or a folder."""
-    online: bool = False
+    online: bool = field(default=False, metadata=affects("slam"))
     """Run keyframe by keyframe on iSAM2 instead of in one batch."""
-    camera_height: float | None = None
+    camera_height: float | None = field(default=None, metadata=affects("odometry"))
     """Height of the camera over the ground, m: gives visual odometry its scale."""
-    camera_pitch: float = 0.0
+    camera_pitch: float = field(default=0.0, metadata=affects("odometry"))
     """How far that camera looks down, rad."""
-    wheel: Path | None = None
+    wheel: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """Length of each step between images, m, a number a line: gives visual odometry its scale."""
-    every: int = 1
+    every: int = field(default=1, metadata=affects("odometry"))
     """Use every so many-th image."""
-    keyframe_distance: float = 0.0
+    keyframe_distance: float = field(default=0.0, metadata=affects("odometry"))
     """Of those, keep one this far from the last, m; with `keyframe_angle` 0 as well, all are kept."""
-    keyframe_angle: float = 0.0
+    keyframe_angle: float = field(default=0.0, metadata=affects("odometry"))
     """Or turned by this much, rad."""
-    sizes: tuple[int, ...] = (576,)
+    sizes: tuple[int, ...] = field(default=(576,), metadata=affects("observe"))
     """Longer sides, px, at which the model looks at each image: one for pictures like those it was trained on, more where
     near objects are many times larger than far ones."""
-    threshold: float = 0.6
+    threshold: float = field(default=0.6, metadata=affects("observe"))
     """Least objectness of a detection."""
-    overlap: float = 0.2
+    overlap: float = field(default=0.2, metadata=affects("observe"))
     """Overlap (IoU) above which two regions of an image describe one object: the less certain one goes. Two regions on one
     object would be two landmarks; of two objects so close in one image another image shows the second."""
-    batch: int = 16
+    batch: int = field(default=16, metadata=affects(None))
     """Images that go through the network at once."""
-    depth: Path | None = None
+    depth: Path | None = field(default=None, metadata=affects("observe", "folder"))
     """Folder of depth pictures (16 bit PNG, same names or same order as the images): refine positions."""
-    depth_unit: float = 1 / 5000
+    depth_unit: float = field(default=1 / 5000, metadata=affects("observe"))
     """Metres of one step of them: TUM 1/5000, YCB-Video 1/10000, millimetres 1/1000."""
-    right: Path | None = None
+    right: Path | None = field(default=None, metadata=affects("observe", "folder"))
     """Folder of the right images of a rectified stereo pair: refine positions."""
-    baseline: float | None = None
+    baseline: float | None = field(default=None, metadata=affects("observe"))
     """Distance of the two cameras, m."""
-    report: bool = True
+    report: bool = field(default=True, metadata=affects(None))
     """Write report.html."""
-    loop_gap: int = 50
+    loop_gap: int = field(default=50, metadata=affects("figures"))
     """Detections further apart than this many keyframes make a loop pair, in the figures."""
-    seed: int = 0
+    seed: int = field(default=0, metadata=affects("figures"))
     """Seed of the samples of the landmarks' shapes, and of the views drawn for the figures."""
-    visual: OdometryConfig = field(default_factory=OdometryConfig)
+    visual: OdometryConfig = field(default_factory=OdometryConfig, metadata=affects("odometry"))
     """Settings of the visual odometry."""
-    slam: SlamConfig = field(default_factory=SlamConfig)
+    slam: SlamConfig = field(default_factory=SlamConfig, metadata=affects("slam"))
     """Settings of the EM."""
 
     def __post_init__(self) -> None:

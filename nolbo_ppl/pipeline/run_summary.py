@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from nolbo_ppl.evaluation.sequence_scores import (
     ShapeModel,
@@ -24,116 +23,47 @@ from nolbo_ppl.evaluation.sequence_scores import (
     shape_figures,
 )
 from nolbo_ppl.evaluation.sequence_truth import DriveTruth, MatchResult, match_detections, object_shown, read_truth
-from nolbo_ppl.inference.slam import NoiseModel, SlamConfig, SlamProblem, solve_with_associations
-from nolbo_ppl.inference.slam.map_files import trajectory_errors
-from nolbo_ppl.io.files import read_json, read_jsonl
-from nolbo_ppl.io.observations import Detections, read_observations
-from nolbo_ppl.io.trajectories import covariance_beside, read_trajectory
-from nolbo_ppl.metrics.trajectory import path_length
-from nolbo_ppl.pipeline.map_mesh import stands
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
+from nolbo_ppl.io.run_folder import RunFolder
+from nolbo_ppl.metrics.trajectory import path_length, trajectory_errors
 from nolbo_ppl.pipeline.noise_file import read_noise
+from nolbo_ppl.structures.detections import Detections
 
 ASSOCIATION_IOU = 0.3
 """Overlap from which a detection is held to be of an object where its association is judged: loose boxes are no wrong loops."""
 
 
-@dataclass(frozen=True)
-class RunResult:
-    """What the files of a run say."""
-
-    table: Detections
-    """Observations."""
-    box: Float[np.ndarray, "k 4"]
-    """Their boxes, px."""
-    azimuth_modes: tuple[Any, ...]
-    """Their azimuth posteriors."""
-    odometry: Float[np.ndarray, "n 4 4"]
-    """Before."""
-    estimate: Float[np.ndarray, "n 4 4"]
-    """After."""
-    truth: Float[np.ndarray, "n 4 4"] | None
-    """True poses."""
-    covariance: Float[np.ndarray, "n-1 6 6"] | None
-    """Covariance of the odometry's steps."""
-    landmarks: tuple[Mapping[str, Any], ...]
-    """Rows of `landmarks.json`."""
-    landmark_of: Int[np.ndarray, " k"]
-    """Landmark that has more than half of each observation's weight, -1 for none."""
-    slam: Mapping[str, Any]
-    """`slam/summary.json`."""
-    noise: NoiseModel
-    """The noise the EM has settled on."""
-    images: tuple[str, ...]
-    """Names of the keyframes' images."""
-
-    @property
-    def exists(self) -> np.ndarray:
-        """Landmarks that are part of the map."""
-        return np.array([stands(row) for row in self.landmarks], dtype=bool)
-
-
-def read_result(folder: Path) -> RunResult:
-    """Read what the stages before have written."""
-    odometry = read_trajectory(folder / "odometry.txt").T_world_camera
-    truth = folder / "truth.txt"
-    rows = [row for _, row in read_jsonl(folder / "observations.jsonl")]
-    landmarks = tuple(read_json(folder / "slam" / "landmarks.json"))
-    number = {row["name"]: j for j, row in enumerate(landmarks)}
-    landmark_of = np.full(len(rows), -1)
-    for k, (_, found) in enumerate(read_jsonl(folder / "slam" / "associations.jsonl")):
-        best = max(found["landmarks"].items(), key=lambda item: item[1], default=("", 0.0))
-        if best[1] > 0.5:
-            landmark_of[k] = number[best[0]]
-    return RunResult(
-        table=read_observations(folder / "observations.jsonl", frames=len(odometry)),
-        box=np.array([row.get("box", [np.nan] * 4) for row in rows], dtype=np.float64).reshape(-1, 4),
-        azimuth_modes=tuple(row.get("azimuth_modes") for row in rows),
-        odometry=odometry,
-        estimate=read_trajectory(folder / "slam" / "trajectory.txt").T_world_camera,
-        truth=read_trajectory(truth, lost=True).T_world_camera if truth.is_file() else None,
-        covariance=covariance_beside(folder / "odometry.txt"),
-        landmarks=landmarks,
-        landmark_of=landmark_of,
-        slam=read_json(folder / "slam" / "summary.json"),
-        noise=read_noise(folder / "slam" / "noise.npz"),
-        images=tuple(str(row["image"]) for _, row in read_jsonl(folder / "frames.jsonl")),
-    )
-
-
-def trajectory_figures(result: RunResult) -> dict[str, Any]:
-    """Errors before and after, and their ratio; empty without a true trajectory."""
-    if result.truth is None:
+def trajectory_figures(run: RunFolder) -> dict[str, Any]:
+    """Errors before and after, as the EM has stated them, and their ratio; empty without a true trajectory."""
+    errors = run.trajectory_errors
+    if run.truth_given is None or "before" not in errors:
         return {}
-    before, after = (trajectory_errors(T, result.truth) for T in (result.odometry, result.estimate))
-    ratio = after["ate"] / before["ate"] if before["ate"] > 0 else float("nan")
-    length = finite(path_length(result.truth))
-    return {"path_length": length, "before": before, "after": after, "after_over_before": finite(ratio)}
+    before, after = errors["before"]["ate"], errors["after"]["ate"]
+    length = finite(path_length(run.truth_given))
+    return {"path_length": length, **errors, "after_over_before": finite(after / before) if before > 0 else None}
 
 
-def oracle_figures(
-    result: RunResult, problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig
-) -> dict[str, Any]:
+def oracle_figures(run: RunFolder, problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig) -> dict[str, Any]:
     """Errors of the same detections under the same noise, associated by the truth: what is left to the association."""
-    assert result.truth is not None
-    state = solve_with_associations(problem, object_of, config, result.noise)
-    oracle = trajectory_errors(state.estimate.T_world_camera, result.truth)
-    after = trajectory_errors(result.estimate, result.truth)["ate"]
+    assert run.truth_given is not None
+    state = solve_with_associations(problem, object_of, config, read_noise(run.slam / "noise.npz"))
+    oracle, after = trajectory_errors(state.estimate.T_world_camera, run.truth_given), run.trajectory_errors["after"]["ate"]
     return {"oracle": oracle, "after_over_oracle": finite(after / oracle["ate"]) if oracle["ate"] > 0 else None}
 
 
-def observation_figures(result: RunResult, matched: MatchResult, truth: DriveTruth, model: ShapeModel | None) -> dict[str, Any]:
+def observation_figures(table: Detections, matched: MatchResult, truth: DriveTruth, model: ShapeModel | None) -> dict[str, Any]:
     """Detections, positions and regions against the truth."""
-    true = matched_truth(matched, result.table.frame, truth)["position"]
+    true = matched_truth(matched, table.frame, truth)["position"]
     true[~matched.counted] = np.nan
     return {
-        **detection_figures(matched, result.table, truth),
-        "position_error": position_figures(result.table.position, true),
-        "coverage90": coverage_figures(matched, result.table, result.azimuth_modes, truth, model),
+        **detection_figures(matched, table, truth),
+        "position_error": position_figures(table.position, true),
+        "coverage90": coverage_figures(matched, table, truth, model),
     }
 
 
 def truth_figures(
-    result: RunResult,
+    run: RunFolder,
     problem: SlamProblem,
     truth: DriveTruth,
     loosely: Int[np.ndarray, " k"],
@@ -143,24 +73,26 @@ def truth_figures(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Everything that is held against the true objects; `loosely` is whose each observation is, for its association."""
-    table = result.table
-    matched = match_detections(table.frame, result.box, table.objectness, truth)
-    owner, purity = owners(loosely, result.landmark_of, len(result.landmarks))
+    table, found = problem.observations, run.associations
+    assert found is not None
+    matched = match_detections(table.frame, table.box, table.objectness, truth)
+    owner, purity = owners(loosely, found.landmark_of, len(run.landmarks))
+    exists = np.array([landmark.in_map for landmark in run.landmarks], dtype=bool)
     out: dict[str, Any] = {
-        "observation_figures": observation_figures(result, matched, truth, model),
-        "loops": loop_figures(table.frame, loosely, result.landmark_of, loop_gap),
-        "map": map_figures(loosely, owner, purity, result.exists, truth, config.track_minimum),
+        "observation_figures": observation_figures(table, matched, truth, model),
+        "loops": loop_figures(table.frame, loosely, found.landmark_of, loop_gap),
+        "map": map_figures(loosely, owner, purity, exists, truth, config.track_minimum),
     }
-    if result.truth is not None:
+    if run.truth_given is not None:
         static = np.where((loosely >= 0) & truth.moving[loosely], -1, loosely)
-        out |= oracle_figures(result, problem, static, config)
-        position = np.array([row["position"] for row in result.landmarks]).reshape(-1, 3)
+        out |= oracle_figures(run, problem, static, config)
+        position = np.array([landmark.position for landmark in run.landmarks]).reshape(-1, 3)
         # Poses of objects are in the world of the drive, that of its true trajectory.
-        error = landmark_errors(position, owner, truth, result.estimate, result.truth)
-        error = error[result.exists & np.isfinite(error)]
+        error = landmark_errors(position, owner, truth, run.estimate, run.truth_given)
+        error = error[exists & np.isfinite(error)]
         out["map"]["median_position_error"] = finite(np.median(error)) if len(error) else None
     if model is not None:
-        out["shape"] = shape_figures(table, result.landmark_of, owner, truth, model, rng)
+        out["shape"] = shape_figures(table, found.landmark_of, owner, truth, model, rng)
     return out
 
 
@@ -179,7 +111,7 @@ def time_figures(seconds: Mapping[str, float], cpu_seconds: Mapping[str, float],
 
 
 def summarise(
-    folder: Path,
+    run: RunFolder,
     seconds: Mapping[str, float],
     cpu_seconds: Mapping[str, float],
     problem: SlamProblem,
@@ -189,11 +121,11 @@ def summarise(
     config: SlamConfig,
     loop_gap: int,
     seed: int,
-) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """Everything `summary.json` holds, and `objects.json`: the true object of each observation, where there is a truth.
+) -> tuple[dict[str, Any], dict[str, str | None] | None]:
+    """Everything `summary.json` holds, and the true object of each observation, where there is a truth.
 
     Args:
-        folder: the run, complete up to its crops.
+        run: the run, complete up to its crops.
         seconds: time of its stages.
         cpu_seconds: processor time of them.
         problem: what SLAM was given.
@@ -203,22 +135,22 @@ def summarise(
         loop_gap: least keyframes between two detections of a loop pair.
         seed: of the views drawn.
     """
-    result = read_result(folder)
+    table = problem.observations
     out: dict[str, Any] = {
-        "frames": len(result.estimate),
-        "observations": len(result.table),
-        "landmarks": int(result.exists.sum()),
-        "loop_pairs": result.slam.get("loop_pairs"),
-        **trajectory_figures(result),
+        "frames": len(run),
+        "observations": len(table),
+        "landmarks": sum(landmark.in_map for landmark in run.landmarks),
+        "loop_pairs": run.slam_summary.get("loop_pairs"),
+        **trajectory_figures(run),
     }
     objects = None
     if drive is not None:
-        truth, table = read_truth(drive, result.images), result.table
-        loosely = object_shown(table.frame, result.box, truth, ASSOCIATION_IOU)
-        objects = {"objects": {name: truth.names[i] if i >= 0 else None for name, i in zip(table.id, loosely.tolist())}}
-        out |= truth_figures(result, problem, truth, loosely, model, config, loop_gap, np.random.default_rng([seed, 3]))
-    out |= time_figures(seconds, cpu_seconds, len(result.estimate))
-    return {**out, "warnings": result.slam.get("warnings", [])}, objects
+        truth = read_truth(drive, run.image_names)
+        loosely = object_shown(table.frame, table.box, truth, ASSOCIATION_IOU)
+        objects = {name: truth.names[i] if i >= 0 else None for name, i in zip(table.id, loosely.tolist())}
+        out |= truth_figures(run, problem, truth, loosely, model, config, loop_gap, np.random.default_rng([seed, 3]))
+    out |= time_figures(seconds, cpu_seconds, len(run))
+    return {**out, "warnings": run.slam_summary.get("warnings", [])}, objects
 
 
 def figure_table(summary: Mapping[str, Any]) -> str:

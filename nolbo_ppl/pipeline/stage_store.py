@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -11,15 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.fields import is_number
 from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.output_folder import contents, locked, sweep
+from nolbo_ppl.io.run_folder import FORMAT, RECORD, check_format
+from nolbo_ppl.progress import progress_bar
 
-RECORD = "run.json"
-"""What a run folder says of itself."""
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ class RunRecord:
         write_json(
             folder / RECORD,
             {
+                "format": FORMAT,
                 "configuration": dict(self.configuration),
                 "versions": dict(self.versions),
                 "seconds": {name: round(value, 3) for name, value in self.seconds.items()},
@@ -100,6 +101,7 @@ def recorded(folder: Path) -> dict[str, Any]:
     values = read_json_object(folder / RECORD)
     if not isinstance(values.get("fingerprints"), dict):
         raise input_error("not the record of a run", file=folder / RECORD, do="choose another --out")
+    check_format(values, folder / RECORD)
     return values
 
 
@@ -154,7 +156,7 @@ def _run(folder: Path, stages: Sequence[PipelineStage], record: RunRecord) -> Ru
     record.write(folder)
     for stage in stages[first:]:
         stage.remove(folder)
-    for stage in tqdm(stages[first:], desc="stages", unit="stage", disable=None, leave=False):
+    for stage in progress_bar(stages[first:], "stages", "stage", leave=False):
         start, cpu = time.perf_counter(), time.process_time()
         try:
             stage.work()
@@ -165,4 +167,5 @@ def _run(folder: Path, stages: Sequence[PipelineStage], record: RunRecord) -> Ru
         record.cpu_seconds[stage.name] = time.process_time() - cpu
         record.fingerprints[stage.name] = wanted[stage.name]
         record.write(folder)
+        LOG.info("%s: %.1f s", stage.name, record.seconds[stage.name])
     return record

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.structures.association_table import AssociationTable
+from nolbo_ppl.structures.detections import Detections
 
 MARGIN = 0.15
 """What is shown around the box, as a share of its sides."""
@@ -30,23 +31,20 @@ class Crop:
     """Weight times objectness times the box's side."""
 
 
-def best_views(observations: Sequence[Mapping[str, Any]], associations: Sequence[Mapping[str, Any]]) -> dict[str, Crop]:
+def best_views(detections: Detections, found: AssociationTable, names: Sequence[str]) -> dict[str, Crop]:
     """For each landmark the detection with the largest weight x objectness x side of its box.
 
     Args:
-        observations: rows of `observations.jsonl`.
-        associations: rows of `associations.jsonl`, in the same order.
+        detections: what SLAM was given.
+        found: the weights, in the order of the detections.
+        names: names of the landmarks.
     """
     best: dict[str, Crop] = {}
-    for seen, found in zip(observations, associations, strict=True):
-        if "box" not in seen:
-            continue
-        box = np.array(seen["box"], dtype=np.float64)
-        side = float(np.sqrt(np.prod(np.maximum(box[2:] - box[:2], 0.0))))
-        for name, weight in found["landmarks"].items():
-            value = float(weight) * float(seen.get("objectness", 1.0)) * side
-            if value > 0 and (name not in best or value > best[name].value):
-                best[name] = Crop(int(seen["frame"]), box, value)
+    side = np.sqrt(np.prod(np.maximum(detections.box[:, 2:] - detections.box[:, :2], 0.0), axis=1))
+    values = found.weight * detections.objectness[found.row] * side[found.row]
+    for k, j, value in zip(found.row.tolist(), found.landmark.tolist(), values.tolist()):
+        if value > 0 and (names[j] not in best or value > best[names[j]].value):  # NaN where there is no box
+            best[names[j]] = Crop(int(detections.frame[k]), detections.box[k], value)
     return best
 
 

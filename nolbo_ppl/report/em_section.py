@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.report.report_plots import above, axis_label, near, way_lines
-from nolbo_ppl.report.run_folder import RunFolder
 from nolbo_ppl.report.svg import Axes, element, equal_axes, escape, number, picture, text
 from nolbo_ppl.report.wording import say, table
 

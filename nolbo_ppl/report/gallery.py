@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 from PIL import Image
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.images import open_image
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.report.report_plots import category_number, colour_of
-from nolbo_ppl.report.run_folder import RunFolder
-from nolbo_ppl.report.run_landmarks import RunLandmark
 from nolbo_ppl.report.shape_thumbnails import data_uri, photo_uri, render_shape
 from nolbo_ppl.report.svg import element, escape
 from nolbo_ppl.report.wording import say
+from nolbo_ppl.structures.landmark import Landmark
 from nolbo_ppl.viz.style import MUTED, category_colour
 
 MOST_CARDS = 300
@@ -22,7 +23,7 @@ MOST_BARS = 4
 
 def order(run: RunFolder) -> list[int]:
     """Landmarks by the weight of their detections, the best seen first."""
-    return sorted(range(len(run.landmarks)), key=lambda k: -(run.landmarks[k].detections or 0.0))[:MOST_CARDS]
+    return sorted(range(len(run.landmarks)), key=lambda k: -np.nan_to_num(run.landmarks[k].detections))[:MOST_CARDS]
 
 
 def _image(uri: str, alt: str, caption: str, empty: str = "") -> str:
@@ -30,7 +31,7 @@ def _image(uri: str, alt: str, caption: str, empty: str = "") -> str:
     return element("figure", inside + element("figcaption", escape(caption)))
 
 
-def pictures(run: RunFolder, landmark: RunLandmark) -> str:
+def pictures(run: RunFolder, landmark: Landmark) -> str:
     """The best crop, the shape, the shape's uncertainty; those that exist."""
     crop, voxels, out = run.crop(landmark.name), run.voxels(landmark.name), ""
     if crop is not None:
@@ -39,7 +40,7 @@ def pictures(run: RunFolder, landmark: RunLandmark) -> str:
             out += _image(photo_uri(image, 224), f"best view of {landmark.name}", "best view")
         except InputError:
             out += _image("", "", "best view", "unreadable picture")
-    elif (run.path / "crops").is_dir():
+    elif run.crops.is_dir():
         out += _image("", "", "best view", "no picture")
     if voxels is not None:
         shape, doubt = render_shape(*voxels, colour_of(run, landmark))
@@ -50,7 +51,7 @@ def pictures(run: RunFolder, landmark: RunLandmark) -> str:
     return element("div", out, class_="pictures") if out else ""
 
 
-def posterior_bars(run: RunFolder, landmark: RunLandmark) -> str:
+def posterior_bars(run: RunFolder, landmark: Landmark) -> str:
     """The most probable categories as bars."""
     found = sorted(landmark.class_posterior.items(), key=lambda item: -item[1])[:MOST_BARS]
     rows = ""
@@ -67,17 +68,17 @@ def posterior_bars(run: RunFolder, landmark: RunLandmark) -> str:
     return element("div", rows, class_="bars") if rows else ""
 
 
-def facts(landmark: RunLandmark) -> str:
+def facts(landmark: Landmark) -> str:
     """Figures of one landmark."""
     rows = []
-    if landmark.existence is not None:
+    if np.isfinite(landmark.existence):
         rows.append(("existence", f"{landmark.existence:.3f}"))
-    if landmark.detections is not None:
+    if np.isfinite(landmark.detections):
         rows.append(("detections", f"{landmark.detections:.1f}"))
     if landmark.frames is not None:
         rows.append(("frames", f"{landmark.frames[0]} – {landmark.frames[1]}"))
     rows.append(("position, m", ", ".join(f"{v:.2f}" for v in landmark.position)))
-    if landmark.spread is not None:
+    if np.isfinite(landmark.spread):
         rows.append(("worst axis, m", f"± {say(landmark.spread)}"))
     if landmark.size is not None:
         rows.append(("size, m", " × ".join(f"{v:.2f}" for v in landmark.size)))
@@ -94,9 +95,9 @@ def card(run: RunFolder, k: int) -> str:
         element("h3", dot + element("span", name)) + pictures(run, landmark) + posterior_bars(run, landmark) + facts(landmark),
         id=f"card-{k}",
         class_="card",
-        data_detections=landmark.detections or 0.0,
-        data_existence=landmark.existence or 0.0,
-        data_spread=landmark.spread or 0.0,
+        data_detections=float(np.nan_to_num(landmark.detections)),
+        data_existence=float(np.nan_to_num(landmark.existence)),
+        data_spread=float(np.nan_to_num(landmark.spread)),
         data_first=landmark.frames[0] if landmark.frames else 0,
         data_category=category_number(run, landmark),
     )

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, path_length
 from nolbo_ppl.report.loop_section import loop_scores
-from nolbo_ppl.report.run_folder import RunFolder
 from nolbo_ppl.report.svg import element, escape
 from nolbo_ppl.report.wording import say
 
 
 def ate(run: RunFolder) -> dict[str, float]:
-    """ATE before and after in m: from the trajectories with truth, else from the summaries."""
+    """ATE before and after in m: as the summaries state them, else from the trajectories with a truth given since."""
     out = {}
     for name, key in (("odometry", "before"), ("estimate", "after")):
+        stated = None if "truth.txt" in run.elsewhere else _find(run.summary, key, "ate") or _find(run.slam_summary, key, "ate")
         T = getattr(run, name)
-        if T is not None and run.truth_given is not None:
+        if stated is not None:
+            out[key] = stated
+        elif T is not None and run.truth_given is not None:
             out[key] = absolute_trajectory_error(T, run.truth_given).rmse
-        else:
-            for summary in (run.summary, run.slam_summary):
-                value = _find(summary, key, "ate")
-                if value is not None:
-                    out.setdefault(key, value)
     oracle = _find(run.summary, "oracle", "ate")
     if oracle is not None:
         out["oracle"] = oracle
@@ -57,15 +55,17 @@ def headline(run: RunFolder) -> str:
     if scores is not None:
         tiles.append(("Loop precision", say(scores["precision"], 3), f"of {say(scores['found'], 3)} pairs of detections"))
         tiles.append(("Loop recall", say(scores["recall"], 3), f"of {say(scores['true'], 3)} true pairs"))
-    sure = sum(x.existence is None or x.existence >= 0.5 for x in run.landmarks)
+    sure = sum(x.likely for x in run.landmarks)
     truth = _find(run.summary, "map", "objects_detected")
     kinds = f"{len(run.categories)} categor{'y' if len(run.categories) == 1 else 'ies'}"
     note = kinds if truth is None else f"{truth:.0f} objects seen often enough"
     tiles.append(("Landmarks", str(sure), note))
     length = path_length(run.estimate)
     tiles.append(("Keyframes", str(len(run)), f"{say(length, 3)} m of way"))
-    if run.associations is not None:
-        tiles.append(("Detections", str(len(run.associations)), f"{len(run.associations) / len(run):.1f} a keyframe"))
+    if run.associations_in_time is not None:
+        tiles.append(
+            ("Detections", str(len(run.associations_in_time)), f"{len(run.associations_in_time) / len(run):.1f} a keyframe")
+        )
     rate = _find(run.summary, "images_per_second")
     if rate is not None:
         tiles.append(("Throughput", f"{say(rate, 3)} / s", "images observed"))

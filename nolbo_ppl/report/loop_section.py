@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.association import association_pairs
-from nolbo_ppl.report.run_folder import RunFolder
-from nolbo_ppl.report.run_landmarks import RunAssociations
+from nolbo_ppl.structures.association_table import AssociationTable
 
 LOOP_GAP = 50
 """Frames between two views that make a loop (as in `summary.json`)."""
@@ -29,14 +29,14 @@ class Loop:
 
 def loop_gap(run: RunFolder) -> int:
     """The gap that makes a loop: the run's own, else 50 keyframes, or a quarter of a drive of less than 200."""
-    configuration = run.run.get("configuration")
+    configuration = run.record.get("configuration")
     stated = configuration.get("loop_gap") if isinstance(configuration, dict) else None
     if isinstance(stated, int) and not isinstance(stated, bool) and stated > 0:
         return stated
     return min(LOOP_GAP, max(len(run) // 4, 2))
 
 
-def find_loops(found: RunAssociations, gap: int) -> list[Loop]:
+def find_loops(found: AssociationTable, gap: int) -> list[Loop]:
     """Every return to a landmark after more than `gap` frames, by its detections of weight above one half.
 
     Needs the frames of the detections; without them there are none.
@@ -53,18 +53,18 @@ def find_loops(found: RunAssociations, gap: int) -> list[Loop]:
 
 def object_labels(run: RunFolder) -> Int[np.ndarray, " k"] | None:
     """Number of the true object of each detection, -1 for none, -2 where it is not known; None when nobody said anything."""
-    if run.objects is None or run.associations is None:
+    if run.objects is None or run.associations_in_time is None:
         return None
     number: dict[str | None, int] = {None: -1}
     for name in run.objects.values():
         number.setdefault(name, len(number) - 1)
-    return np.array([number[run.objects[i]] if i in run.objects else -2 for i in run.associations.id], dtype=np.int64)
+    return np.array([number[run.objects[i]] if i in run.objects else -2 for i in run.associations_in_time.id], dtype=np.int64)
 
 
 def is_right(run: RunFolder, loop: Loop) -> bool | None:
     """Whether both ends of a loop are one true object; None when truth does not say."""
     label = object_labels(run)
-    found = run.associations
+    found = run.associations_in_time
     if label is None or found is None or found.frame is None:
         return None
     mine = found.landmark_of == loop.landmark
@@ -82,7 +82,7 @@ def loop_scores(run: RunFolder) -> dict[str, float | None] | None:
             key: stated.get(name)
             for key, name in (("precision", "precision"), ("recall", "recall"), ("found", "found_pairs"), ("true", "true_pairs"))
         }
-    label, found = object_labels(run), run.associations
+    label, found = object_labels(run), run.associations_in_time
     if label is None or found is None or found.frame is None:
         return None
     known = label > -2

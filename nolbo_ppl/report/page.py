@@ -6,8 +6,8 @@ from os import PathLike
 from pathlib import Path
 
 from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.io.run_folder import RunFolder, read_run
 from nolbo_ppl.report.headline import headline, warnings
-from nolbo_ppl.report.run_folder import RunFolder, read_run
 from nolbo_ppl.report.sections import SECTIONS
 from nolbo_ppl.report.svg import element, escape
 

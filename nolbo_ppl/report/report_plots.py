@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nolbo_ppl.geometry.pose import relative, rotation_angle
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import align
 from nolbo_ppl.report.loop_section import Loop, is_right
-from nolbo_ppl.report.run_folder import RunFolder
-from nolbo_ppl.report.run_landmarks import RunLandmark
 from nolbo_ppl.report.svg import CHI2_95, Axes, element, equal_axes, group, number, picture
 from nolbo_ppl.report.wording import say
+from nolbo_ppl.structures.landmark import Landmark
 from nolbo_ppl.viz.style import MUTED, category_colour
 
 MOST_STRIPS = 400
@@ -99,23 +99,23 @@ def trajectory_plot(run: RunFolder) -> str:
     return picture(axes, parts, "Trajectories from above")
 
 
-def landmark_tip(landmark: RunLandmark) -> str:
+def landmark_tip(landmark: Landmark) -> str:
     """What a landmark says when it is pointed at."""
     lines = [landmark.name + (f" – {landmark.category}" if landmark.category else "")]
     if landmark.category in landmark.class_posterior:
         lines[0] += f" ({landmark.class_posterior[str(landmark.category)]:.2f})"
-    if landmark.existence is not None:
+    if np.isfinite(landmark.existence):
         lines.append(f"existence {landmark.existence:.3f}")
-    if landmark.detections is not None:
+    if np.isfinite(landmark.detections):
         lines.append(f"{landmark.detections:.1f} detections")
     if landmark.frames is not None:
         lines.append(f"frames {landmark.frames[0]} to {landmark.frames[1]}")
-    if landmark.spread is not None:
+    if np.isfinite(landmark.spread):
         lines.append(f"position ± {say(landmark.spread)} m along its worst axis")
     return "\n".join(lines)
 
 
-def colour_of(run: RunFolder, landmark: RunLandmark) -> str:
+def colour_of(run: RunFolder, landmark: Landmark) -> str:
     """Colour of a landmark's category."""
     return MUTED if landmark.category is None else category_colour(landmark.category, run.categories)
 
@@ -127,11 +127,11 @@ def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
     for k, landmark in enumerate(run.landmarks):
         colour, xy = colour_of(run, landmark), landmark.position[index]
         mark = ""
-        if ellipses and landmark.position_covariance is not None:
+        if ellipses and np.isfinite(landmark.position_covariance).all():
             covariance = landmark.position_covariance[np.ix_(index, index)]
             kind = "ellipse wide" if is_wide(axes, covariance) else "ellipse"
             mark = axes.ellipse(xy, covariance, class_=kind, style=f"stroke:{colour};fill:{colour}")
-        weak = landmark.existence is not None and landmark.existence < 0.5
+        weak = not landmark.likely
         mark += element(
             "circle",
             cx=number(float(axes.px(xy[0]))),
@@ -146,7 +146,7 @@ def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
     return axes.clip(parts)
 
 
-def category_number(run: RunFolder, landmark: RunLandmark) -> int:
+def category_number(run: RunFolder, landmark: Landmark) -> int:
     """Number of its category among those of the map, -1 for none: class names must not hold the user's text."""
     return -1 if landmark.category is None else run.categories.index(landmark.category)
 

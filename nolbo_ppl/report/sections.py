@@ -6,6 +6,7 @@ import shlex
 
 import numpy as np
 
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.report.em_section import em_slider, iteration_table
 from nolbo_ppl.report.gallery import gallery
 from nolbo_ppl.report.loop_section import find_loops, is_right, loop_gap, loop_scores
@@ -20,7 +21,6 @@ from nolbo_ppl.report.report_plots import (
     trajectory_plot,
     ways,
 )
-from nolbo_ppl.report.run_folder import RunFolder
 from nolbo_ppl.report.svg import element, escape
 from nolbo_ppl.report.weight_heatmap import heat_map
 from nolbo_ppl.report.wording import figures_tables, say, settings_table
@@ -101,13 +101,13 @@ def world_map(run: RunFolder) -> str:
 
 def loop_closures(run: RunFolder) -> str:
     """Links of loops and how many of them are right."""
-    if run.associations is None or not run.landmarks:
+    if run.associations_in_time is None or not run.landmarks:
         return ""
-    if run.associations.frame is None:
+    if run.associations_in_time.frame is None:
         missing = "The frames of the detections are not in this folder: give --observations to see the loops."
         return element("p", missing, class_="note")
     gap = loop_gap(run)
-    loops = find_loops(run.associations, gap)
+    loops = find_loops(run.associations_in_time, gap)
     if not loops:
         return element("p", f"No landmark was seen again after more than {gap} keyframes.", class_="note")
     scores, said = loop_scores(run), ""
@@ -125,7 +125,7 @@ def loop_closures(run: RunFolder) -> str:
 
 def association(run: RunFolder) -> str:
     """The heat map."""
-    if run.associations is None or not len(run.associations):
+    if run.associations_in_time is None or not len(run.associations_in_time):
         return ""
     caption = (
         "Marginal probability that a detection is of a landmark (opacity; colour: category). "
@@ -169,7 +169,7 @@ def figures(run: RunFolder) -> str:
 
 def command_of(run: RunFolder) -> str:
     """The command as the run states it, else its inputs and outputs as options; empty when nothing is known."""
-    command, options = run.run.get("command"), run.run.get("configuration")
+    command, options = run.record.get("command"), run.record.get("configuration")
     if command:
         return command if isinstance(command, str) else shlex.join(map(str, command))
     if not isinstance(options, dict):
@@ -185,9 +185,9 @@ def how(run: RunFolder) -> str:
     parts, command = "", command_of(run)
     if command:
         parts += element("pre", element("code", escape(command)))
-    if isinstance(run.run.get("complete"), list):
-        parts += element("p", escape("Complete stages: " + ", ".join(map(str, run.run["complete"])) + "."))
-    sources = (("run", run.run), ("SLAM", run.slam_summary))
+    if isinstance(run.record.get("complete"), list):
+        parts += element("p", escape("Complete stages: " + ", ".join(map(str, run.record["complete"])) + "."))
+    sources = (("run", run.record), ("SLAM", run.slam_summary))
     for title, key, opened in SETTINGS:
         for name, values in sources:
             if isinstance(values.get(key), dict) and values[key]:

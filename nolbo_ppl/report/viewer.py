@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from nolbo_ppl.errors import InputError, input_error
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
 from nolbo_ppl.io.images import open_image
-from nolbo_ppl.report.run_folder import RunFolder, read_run
+from nolbo_ppl.io.run_folder import RunFolder, read_run
 from nolbo_ppl.report.viewer_objects import Rgb, add_objects
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import matrix_to_quaternion
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.report.report_plots import colour_of
-from nolbo_ppl.report.run_folder import RunFolder
-from nolbo_ppl.report.run_landmarks import RunLandmark
 from nolbo_ppl.report.shape_thumbnails import shape_surface
+from nolbo_ppl.structures.landmark import Landmark
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -37,7 +37,7 @@ def ellipsoid(covariance: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "
     return np.sqrt(CHI2_95 * np.maximum(values, 1e-12)), vectors
 
 
-def add_shape(server: ViserServer, name: str, run: RunFolder, landmark: RunLandmark) -> Any:
+def add_shape(server: ViserServer, name: str, run: RunFolder, landmark: Landmark) -> Any:
     """The decoded surface in metres; a box of its size where nothing was decoded, a small ball without a size."""
     quaternion, colour = matrix_to_quaternion(landmark.T_world_object[:3, :3])[[3, 0, 1, 2]], rgb(colour_of(run, landmark))
     voxels = run.voxels(landmark.name)
@@ -67,10 +67,10 @@ def add_shape(server: ViserServer, name: str, run: RunFolder, landmark: RunLandm
     )
 
 
-def label_of(landmark: RunLandmark) -> str:
+def label_of(landmark: Landmark) -> str:
     """Name, category, existence."""
     words = [landmark.name, *([landmark.category] if landmark.category else [])]
-    return " ".join(words) + (f" ({landmark.existence:.2f})" if landmark.existence is not None else "")
+    return " ".join(words) + (f" ({landmark.existence:.2f})" if np.isfinite(landmark.existence) else "")
 
 
 def add_objects(add: Callable[[str, str, Any], Any], run: RunFolder, server: ViserServer) -> None:
@@ -83,7 +83,7 @@ def add_objects(add: Callable[[str, str, Any], Any], run: RunFolder, server: Vis
         run: the run.
         server: the server.
     """
-    whole = run.path / "map.glb"
+    whole = run.mesh
     from_file = whole.is_file() and not run.voxel_names
     if from_file:
         turn = (0.0, 1.0, 0.0, 0.0)  # glTF has y up: half a turn about x gives the world of the run
@@ -91,7 +91,7 @@ def add_objects(add: Callable[[str, str, Any], Any], run: RunFolder, server: Vis
     for k, landmark in enumerate(run.landmarks):
         if not from_file:
             add("objects", f"/objects/{k}", add_shape(server, f"/objects/{k}", run, landmark))
-        if landmark.position_covariance is not None:
+        if np.isfinite(landmark.position_covariance).all():
             radii, R = ellipsoid(landmark.position_covariance)
             handle = server.scene.add_icosphere(
                 f"/ellipsoids/{k}",

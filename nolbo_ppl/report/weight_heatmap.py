@@ -7,11 +7,11 @@ import json
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.report.report_plots import colour_of
-from nolbo_ppl.report.run_folder import RunFolder
-from nolbo_ppl.report.run_landmarks import RunAssociations
 from nolbo_ppl.report.shape_thumbnails import data_uri
 from nolbo_ppl.report.svg import element, escape
+from nolbo_ppl.structures.association_table import AssociationTable
 from nolbo_ppl.viz.style import MUTED
 
 MOST_COLUMNS = 1000
@@ -20,7 +20,7 @@ MOST_ROWS = 900
 """More landmarks than this share rows."""
 
 
-def weight_grid(found: RunAssociations, landmarks: int) -> Float[np.ndarray, "m k"]:
+def weight_grid(found: AssociationTable, landmarks: int) -> Float[np.ndarray, "m k"]:
     """Weights as a dense grid: a row for each landmark, then new objects, then background; neighbours share columns where there
     are too many.
     """
@@ -33,7 +33,7 @@ def weight_grid(found: RunAssociations, landmarks: int) -> Float[np.ndarray, "m 
     return np.clip(grid, 0, 1)
 
 
-def landmark_order(run: RunFolder, found: RunAssociations) -> list[int]:
+def landmark_order(run: RunFolder, found: AssociationTable) -> list[int]:
     """Landmarks by the first observation that is theirs: time runs down as it runs across."""
     first = np.full(len(run.landmarks), len(found))
     strong = found.weight > 0.1
@@ -46,7 +46,7 @@ def heat_map(run: RunFolder) -> str:
 
     The weight is the opacity of a cell, so that the picture suits light and dark pages alike.
     """
-    found = run.associations
+    found = run.associations_in_time
     assert found is not None
     order = landmark_order(run, found)[:MOST_ROWS]
     grid = weight_grid(found, len(run.landmarks))
@@ -74,7 +74,7 @@ def heat_map(run: RunFolder) -> str:
     return element("div", side + element("div", body, class_="heat-body"), class_="heat-map", tabindex=0)
 
 
-def _frame_ticks(found: RunAssociations, columns: int) -> str:
+def _frame_ticks(found: AssociationTable, columns: int) -> str:
     """Labels under the picture: frames, or numbers of observations when frames are not known."""
     ticks, count = [], len(found)
     for share in np.linspace(0, 1, 9):

@@ -117,6 +117,11 @@ class Detections:
         """Rows with a box in the image."""
         return np.isfinite(self.box).all(axis=1)
 
+    @property
+    def has_azimuth(self) -> Bool[np.ndarray, " n"]:
+        """Rows that state the modes of their azimuth."""
+        return np.isfinite(self.azimuth_weight).any(axis=1)
+
     def select(self, rows: np.ndarray) -> Detections:
         """The given rows (indices or a mask), in that order."""
         index = np.arange(len(self))[rows]

@@ -48,7 +48,18 @@ class RotationModes:
 
 @dataclass(frozen=True)
 class ObjectPosteriors:
-    """Posteriors of the n objects of one image, best objectness first; metres, radians, the camera's frame."""
+    """Posteriors of the n objects of one image, best objectness first; metres, radians, the camera's frame.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> image = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+        >>> boxes, intrinsics = np.array([[20.0, 20.0, 70.0, 60.0]]), [100.0, 100.0, 48.0, 48.0]
+        >>> (seen,) = nolbo_ppl.load("tiny").observe_boxes([image], intrinsics, [boxes], decode=False)
+        >>> seen.class_posterior.sum().round(6), seen.position.shape, seen.position_covariance.shape
+        (np.float64(1.0), (1, 3), (1, 3, 3))
+        >>> seen.detections(frame=7, image="photograph.png").id  # as SLAM takes them
+        ('000007-000',)
+    """
 
     categories: tuple[str, ...]
     """Names of the category labels."""

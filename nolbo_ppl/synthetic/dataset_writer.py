@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
 from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.parallel import parallel
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.scenes.scene_records import record_of
 from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
@@ -103,7 +103,7 @@ def _render_missing(out: Path, source: SceneSource, count: int, workers: int) ->
     missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]
     jobs = [(_write_chunk, (source, out, first, last)) for first, last in missing]
     done = count - sum(last - first for first, last in missing)
-    with tqdm(total=count, initial=done, desc="writing scenes", unit="scene", disable=None) as bar:
+    with progress_bar(None, "writing scenes", "scene", total=count, done=done) as bar:
         for number in parallel(jobs, workers):
             bar.update(number)
 

@@ -44,7 +44,13 @@ LARGEST_RATE = 10.0
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything a training run depends on."""
+    """Everything a training run depends on.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> nolbo_ppl.TrainConfig(preset="nano", latent_dim=8).model().latent_dim
+        8
+    """
 
     out: Path = Path("runs/tiny")
     """Folder of the run: configuration, metrics.jsonl, checkpoint, and at the end the model."""

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import torch
 import torch.distributed as distributed
-from tqdm import tqdm
 
 from nolbo_ppl._version import __version__
 from nolbo_ppl.data.loader import prefetch
@@ -27,6 +26,7 @@ from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.training.detector_file import adopt
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
@@ -149,8 +149,7 @@ def _train_stage(
     name, steps = stage_run.stage.name, stage_run.stage.optimisation.steps
     waited, start = 0.0, time.perf_counter()
     batches = data.batches(name, stage_run.state.step)
-    quiet = True if journal.rank else None
-    bar = tqdm(total=steps, initial=stage_run.state.step, desc=name, unit="step", disable=quiet)
+    bar = progress_bar(None, name, "step", total=steps, done=stage_run.state.step, shown=not journal.rank)
     with bar, batches if isinstance(batches, prefetch) else nullcontext():
         while not stage_run.finished:
             before = time.perf_counter()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.evaluation.measure import SceneTruth
 from nolbo_ppl.metrics.detection import Matches
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import show_part
 from nolbo_ppl.viz.style import MUTED, category_colour, new_figure, plain, save, styled
@@ -28,7 +28,7 @@ AREA = 26.0
 class Scenes(Protocol):
     """Labelled scenes by number."""
 
-    def __getitem__(self, index: int) -> SceneTruth: ...
+    def __getitem__(self, index: int) -> Annotations: ...
 
 
 @runtime_checkable
@@ -89,7 +89,7 @@ def write_detections(found: Matches, scenes: Scenes, model: Model, path: str | P
     return figure
 
 
-def _draw(axes: Axes, scene: SceneTruth, answer: ObjectPosteriors) -> None:
+def _draw(axes: Axes, scene: Annotations, answer: ObjectPosteriors) -> None:
     """One scene."""
     height, width = scene.image.shape[:2]
     show_part(axes, scene.image, (0, width), (0, height))

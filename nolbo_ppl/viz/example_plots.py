@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.evaluation.measure import SceneTruth
 from nolbo_ppl.evaluation.records import ObjectRecords
 from nolbo_ppl.geometry.voxels import unpack_voxels
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import draw_frame, show_part
 from nolbo_ppl.viz.shape_plots import draw_shape
@@ -31,7 +31,7 @@ TRUE_AXES = ("white", "white", "white")
 class Scenes(Protocol):
     """Labelled scenes by number."""
 
-    def __getitem__(self, index: int) -> SceneTruth: ...
+    def __getitem__(self, index: int) -> Annotations: ...
 
 
 @runtime_checkable
@@ -136,7 +136,7 @@ def _draw_example(
     axes.text(0.5, 1.02, ", ".join(numbers), transform=axes.transAxes, ha="center", fontsize=7, color=MUTED)
     if answer.voxel_mean is not None:
         draw_shape(figure, cells[1, 0], answer.voxel_mean[0], colour, answer.viewpoint[0])
-    if truth.voxels[slot].any():
+    if truth.voxels is not None and truth.voxels[slot].any():
         side = round((8 * truth.voxels.shape[1]) ** (1 / 3))
         grid = unpack_voxels(truth.voxels[slot], side)
         draw_shape(figure, cells[1, 1], grid.astype(np.float64), "#9aa3ab", answer.viewpoint[0])

@@ -7,16 +7,9 @@ from os import PathLike
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.geometry.alignment import align, principal_plane
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.io.files import atomic_path
-from nolbo_ppl.metrics.trajectory import align
-
-
-def principal_plane(points: Float[np.ndarray, "n 3"]) -> tuple[int, int]:
-    """The two axes along which points spread most: x and z for a car (seen from above)."""
-    spread = np.ptp(points, axis=0) if len(points) else np.ones(3)
-    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    return first, second
 
 
 def draw_map(

@@ -93,7 +93,7 @@ def test_bad_input_of_a_real_run_ends_without_a_traceback(tmp_path: Path) -> Non
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
-    assert f"{tmp_path}: a folder without images" in done.stderr
+    assert f"{tmp_path}: no image in the folder" in done.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -15,12 +15,13 @@ from nolbo_ppl.cli import evaluate
 from nolbo_ppl.cli.evaluate import EvaluateConfig, measure, metrics, open_scenes, table
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes
-from nolbo_ppl.evaluation.measure import SceneTruth, measure_detections, measure_objects
+from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
 from nolbo_ppl.evaluation.scores import REQUIRED, confusion, flipped
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels, voxel_centres
 from nolbo_ppl.metrics.detection import match
 from nolbo_ppl.models.model_config import tiny
+from nolbo_ppl.structures.annotations import ARRAYS, Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 from nolbo_ppl.viz.example_plots import badness
 
@@ -57,18 +58,16 @@ def made_scenes(count, seed=0, objects=4):
         viewpoint = rng.uniform([-math.pi, -0.1, -0.1], [math.pi, 0.8, 0.1], (objects, 3))
         viewpoints.append(viewpoint)
         scenes.append(
-            SceneTruth(
-                image=rng.integers(0, 256, (64, 64, 3), dtype=np.uint8),
+            Annotations.from_arrays(
+                pixels=rng.integers(0, 256, (64, 64, 3), dtype=np.uint8),
                 intrinsics=CAMERA,
                 box=box,
-                category=category,
+                category=[CATEGORIES[label] for label in category],
                 R_camera_object=egocentric(viewpoint, position),
                 position=position,
                 symmetry=SYMMETRY[category],
-                visibility=np.ones(objects),
                 voxels=pack_voxels(ellipsoids(rng, objects)),
                 diagonal=np.ones(objects),
-                ignore=np.zeros((0, 4)),
             )
         )
     return scenes, viewpoints
@@ -103,10 +102,10 @@ class Oracle:
         teacher, _ = self.shape_posterior(scene.voxels)
         latent_scale = rng.uniform(0.5, 2.0, (n, d))
         probability = rng.dirichlet(np.full(LABELS, 0.15), n)
-        for i, true in enumerate(scene.category):  # the true label is a draw of the posterior
+        for i, true in enumerate(scene.labels(CATEGORIES)):  # the true label is a draw of the posterior
             drawn = rng.choice(LABELS, p=probability[i])
             probability[i, [drawn, true]] = probability[i, [true, drawn]]
-        likelihood = np.where(np.arange(LABELS) == scene.category[:, None], 0.0, -10.0)
+        likelihood = np.where(np.arange(LABELS) == scene.labels(CATEGORIES)[:, None], 0.0, -10.0)
         best = np.stack((mean, *tilt.T), 1)
         return ObjectPosteriors(
             categories=CATEGORIES,
@@ -171,7 +170,7 @@ def exactly(said, scene, rng, viewpoints):
     """Everything right and certain."""
     viewpoint = viewpoints[scene.image.tobytes()]
     n = len(scene.box)
-    certain = np.where(np.arange(LABELS) == scene.category[:, None], 0.0, -30.0)
+    certain = np.where(np.arange(LABELS) == scene.labels(CATEGORIES)[:, None], 0.0, -30.0)
     return dataclasses.replace(
         said,
         objectness=np.ones(n),
@@ -247,7 +246,7 @@ def test_known_faults_give_known_figures():
             return said
         turned = said.viewpoint + np.array([math.pi, 0, 0])
         likelihood = said.class_log_likelihood.copy()
-        likelihood[0, (scene.category[0] + 1) % LABELS] = 5.0
+        likelihood[0, (scene.labels(CATEGORIES)[0] + 1) % LABELS] = 5.0
         box = said.box.copy()
         box[3] += 400.0
         return dataclasses.replace(
@@ -260,7 +259,7 @@ def test_known_faults_give_known_figures():
         )
 
     result = measure(config(), exact_oracle(scenes, viewpoints, change), scenes)
-    category = np.concatenate([s.category for s in scenes])
+    category = np.concatenate([s.labels(CATEGORIES) for s in scenes])
     spoilt = np.repeat(np.arange(40) % 4 == 0, 4)
     by_category = [1 - spoilt[category == c].mean() for c in range(LABELS) if (category == c).any()]
     plain = [1 - spoilt[category == c].mean() for c in range(LABELS) if (category == c).any() and SYMMETRY[c] == 1]
@@ -320,7 +319,7 @@ def test_small_and_hidden_objects_do_not_count():
     result = measure(config(), exact_oracle(hidden, viewpoints), hidden)
     assert len(result.objects) == 20 and set(result.objects.slot) == {2, 3}
     # Everything is found, what does not count included, and none of that is held against the model.
-    assert result.figures["ap50"] == evaluate.Estimate(1.0, 1.0, 1.0, 20)
+    assert result.figures["ap50"] == evaluate.IntervalEstimate(1.0, 1.0, 1.0, 20)
     assert result.detections.all.ignored.sum() == 20
 
 
@@ -422,10 +421,10 @@ def test_missing_labels_are_left_out():
             scene,
             R_camera_object=scene.R_camera_object.copy(),
             position=scene.position.copy(),
-            category=scene.category.copy(),
+            category=(*scene.category[:2], None, *scene.category[3:]),
             voxels=scene.voxels.copy(),
         )
-        part.R_camera_object[0], part.position[1], part.category[2], part.voxels[3] = np.nan, np.nan, -1, 0
+        part.R_camera_object[0], part.position[1], part.voxels[3] = np.nan, np.nan, 0
         partly.append(part)
     model = exact_oracle(scenes, viewpoints)
     result = measure(config(), model, partly)
@@ -515,11 +514,12 @@ def test_folder_and_generated_scenes_are_the_same(scene_folder):
     model_config = dataclasses.replace(tiny(), image_size=64)
     read = open_scenes(config(scenes=scene_folder, count=5), model_config)
     assert isinstance(read, FolderScenes) and len(read) == 5
-    generated = GeneratedScenes(SceneSource(preset("easy", 64), seed=evaluate.SEED), 5, CATEGORIES)
+    generated = GeneratedScenes(SceneSource(preset("easy", 64), seed=evaluate.SEED), 5)
     for index in range(5):
         a, b = read[index], generated[index]
-        for field in dataclasses.fields(SceneTruth):
-            np.testing.assert_allclose(getattr(a, field.name), getattr(b, field.name), atol=1e-5, err_msg=field.name)
+        for name in (*ARRAYS, "intrinsics", "ignore", "voxels", "pixels"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-5, err_msg=name)
+        assert (a.category, a.instance, a.exhaustive) == (b.category, b.instance, b.exhaustive)
 
 
 @pytest.mark.slow
@@ -536,7 +536,7 @@ def test_labels_without_a_symmetry_have_the_one_the_model_declares(scene_folder,
     scenes = open_scenes(config(scenes=tmp_path), declared)
     seen = 0
     for index in range(len(scenes)):
-        np.testing.assert_array_equal(scenes[index].symmetry, scenes[index].category + 2)
+        np.testing.assert_array_equal(scenes[index].symmetry, scenes[index].labels(CATEGORIES) + 2)
         seen += len(scenes[index].symmetry)
     assert seen > 0
 

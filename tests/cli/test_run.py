@@ -172,10 +172,12 @@ def test_keyframes_by_distance(known: SimulatedDrive, tmp_path: Path) -> None:
     mission.odometry()
     kept = read_trajectory(tmp_path / "odometry.txt").T_world_camera
     given = read_trajectory(known.folder / "odometry.txt").T_world_camera
-    np.testing.assert_allclose(kept, given[mission.keyframes], atol=1e-9)
+    np.testing.assert_allclose(kept, given[mission.run.keyframes], atol=1e-9)
     step = np.linalg.norm(np.diff(kept[:, :3, 3], axis=0), axis=1)
     assert step.min() >= 4.0 and step.max() < 8.0
-    np.testing.assert_allclose(read_trajectory(tmp_path / "truth.txt").T_world_camera, known.truth[mission.keyframes], atol=1e-9)
+    np.testing.assert_allclose(
+        read_trajectory(tmp_path / "truth.txt").T_world_camera, known.truth[mission.run.keyframes], atol=1e-9
+    )
 
 
 def test_covariances_beside_an_odometry_come_with_it(known: SimulatedDrive, tmp_path: Path) -> None:

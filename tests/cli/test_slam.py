@@ -147,7 +147,7 @@ def test_interruption_leaves_no_half_written_file(folder: Path, tmp_path: Path, 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(export, "association_rows", interrupted)
+    monkeypatch.setattr(export, "association_table", interrupted)
     with pytest.raises(SystemExit) as stop:
         main([*arguments(folder, tmp_path), "--config.em-iterations", "1"])
     assert stop.value.code == 130

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
@@ -24,6 +25,7 @@ from nolbo_ppl.evaluation.sequence_scores import (
 from nolbo_ppl.evaluation.sequence_truth import MatchResult, read_truth
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 from nolbo_ppl.geometry.rotation import ray_rotation, viewpoint_to_matrix
+from nolbo_ppl.structures.detections import Detections
 from tests.evaluation.test_sequence_truth import names
 from tests.simulated_sequence import SimulatedDrive
 
@@ -45,18 +47,20 @@ def test_mass_of_the_azimuth_region_far_off_axis() -> None:
     R_ray = ray_rotation(torch.from_numpy(position)).numpy()
     off = 0.21
     true = R_ray @ viewpoint_to_matrix(torch.tensor([1.1 + off, 0.2, -0.1])).numpy()
-    modes = [
-        [{"weight": 1.0, "azimuth": 1.1, "concentration": 30.0}],
-        [
-            {"weight": 0.5, "azimuth": 1.1, "concentration": 30.0},
-            {"weight": 0.5, "azimuth": 1.1 - math.pi, "concentration": 30.0},
-        ],
-    ]
-    mass = orientation_mass(modes, np.tile(position, (2, 1)), np.tile(true, (2, 1, 1)), np.array([1, 2]))
+    seen = dataclasses.replace(
+        Detections.from_arrays([0, 0], np.tile(position, (2, 1))),
+        azimuth_weight=np.array([[1.0, np.nan], [0.5, 0.5]]),
+        azimuth=np.array([[1.1, np.nan], [1.1, 1.1 - math.pi]]),
+        azimuth_concentration=np.array([[30.0, np.nan], [30.0, 30.0]]),
+    )
+    mass = orientation_mass(seen, np.tile(position, (2, 1)), np.tile(true, (2, 1, 1)), np.array([1, 2]))
     expected = vonmises(30.0).cdf(off) - vonmises(30.0).cdf(-off)
     # Two modes half a turn apart, of an object that half a turn leaves as it is: one mode.
     np.testing.assert_allclose(mass, expected, atol=2e-3)
-    assert len(orientation_mass([], np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=int))) == 0
+    assert (
+        len(orientation_mass(seen.select(np.zeros(0, dtype=int)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=int)))
+        == 0
+    )
 
 
 def test_loop_pairs_by_enumeration() -> None:
@@ -110,7 +114,7 @@ def known(drive: SimulatedDrive) -> MatchResult:
     truth, table = read_truth(drive.folder, names(drive)), drive.model.table
     row = np.full(len(table), -1)
     for k, i in enumerate(drive.object_of):
-        hit = np.flatnonzero(truth.frames[table.frame[k]].object == i)
+        hit = np.flatnonzero(truth.shown[table.frame[k]] == i)
         row[k] = hit[0] if len(hit) else -1
     of = np.where(row >= 0, drive.object_of, -1)
     return MatchResult(of, row, of >= 0, int((of >= 0).sum()), int((of >= 0).sum()))
@@ -120,12 +124,12 @@ def test_regions_of_honest_noise_hold_what_they_promise(drive: SimulatedDrive) -
     """The simulation draws what it states: 90 % of positions and latents lie inside, within five standard errors."""
     truth, table, matched = read_truth(drive.folder, names(drive)), drive.model.table, known(drive)
     model = drive.model
-    figures = coverage_figures(matched, table, [None] * len(table), truth, model)
+    figures = coverage_figures(matched, table, truth, model)
     error = 5 * math.sqrt(0.9 * 0.1 / figures["count"])
     assert figures["position"] == pytest.approx(0.9, abs=error)
     assert figures["latent"] == pytest.approx(0.9, abs=error)
     assert figures["orientation"] is None
-    narrow = coverage_figures(matched, table, [None] * len(table), truth, None)
+    narrow = coverage_figures(matched, table, truth, None)
     assert narrow["latent"] is None and narrow["position"] == figures["position"]
     seen = detection_figures(matched, table, truth)
     assert seen["category_accuracy"] == 1.0 and 1.0 < seen["median_rotation_error_deg"] < 6.0

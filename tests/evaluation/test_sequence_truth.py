@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.evaluation.sequence_truth import DriveTruth, TrueFrame, match_detections, object_shown, read_truth
+from nolbo_ppl.evaluation.sequence_truth import DriveTruth, match_detections, object_shown, read_truth
+from nolbo_ppl.structures.annotations import Annotations
 from tests.simulated_sequence import SimulatedDrive
 
 
@@ -24,15 +25,15 @@ def test_truth_of_a_drive(drive: SimulatedDrive) -> None:
     seen = truth.frames[2]  # the frames that were asked for, in that order
     T = drive.truth[15]
     world = np.einsum("ij,nj->ni", T[:3, :3], seen.position) + T[:3, 3]
-    np.testing.assert_allclose(world, truth.T_world_object[seen.object, :3, 3], atol=1e-9)
-    np.testing.assert_allclose(T[:3, :3] @ seen.R_camera_object, truth.T_world_object[seen.object, :3, :3], atol=1e-9)
+    np.testing.assert_allclose(world, truth.T_world_object[truth.shown[2], :3, 3], atol=1e-9)
+    np.testing.assert_allclose(T[:3, :3] @ seen.R_camera_object, truth.T_world_object[truth.shown[2], :3, :3], atol=1e-9)
 
 
 def test_every_simulated_detection_finds_its_object(drive: SimulatedDrive) -> None:
     """Boxes follow from noisy positions: what matches is right, and with exact boxes everything matches."""
     truth, table = read_truth(drive.folder, names(drive)), drive.model.table
-    seen = np.concatenate([frame.object for frame in truth.frames])
-    frame = np.repeat(np.arange(len(truth.frames)), [len(one.object) for one in truth.frames])
+    seen = np.concatenate(truth.shown)
+    frame = np.repeat(np.arange(len(truth.frames)), [len(one) for one in truth.frames])
     exact = match_detections(frame, np.concatenate([one.box for one in truth.frames]), np.ones(len(frame)), truth)
     np.testing.assert_array_equal(exact.object, seen)
     assert exact.recall == 1.0 and exact.precision == 1.0
@@ -46,12 +47,11 @@ def test_every_simulated_detection_finds_its_object(drive: SimulatedDrive) -> No
 
 def one_frame(box: list[list[float]], visibility: list[float]) -> DriveTruth:
     n = len(box)
-    frame = TrueFrame(
-        np.arange(n), np.array(box), np.tile([0, 0, 5.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1)), np.array(visibility)
-    )
+    ids = tuple(str(k) for k in range(n))
+    frame = Annotations.from_arrays([100, 100, 50, 50], box, id=ids, visibility=visibility)
     text = tuple("x" * n)
     return DriveTruth(
-        text, text, text, np.tile(np.eye(4), (n, 1, 1)), np.ones(n), np.ones(n, dtype=int), np.zeros(n, dtype=bool), {}, (frame,)
+        ids, text, text, np.tile(np.eye(4), (n, 1, 1)), np.ones(n), np.ones(n, dtype=int), np.zeros(n, dtype=bool), {}, (frame,)
     )
 
 

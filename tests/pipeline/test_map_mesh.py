@@ -11,8 +11,12 @@ import trimesh
 from PIL import Image
 
 from nolbo_ppl.geometry.pose import make_pose, matrix_to_quaternion, so3_exp
-from nolbo_ppl.pipeline.map_mesh import build_scene, landmark_mesh, landmark_pose, write_glb
+from nolbo_ppl.io.landmarks import parse_landmark
+from nolbo_ppl.pipeline.map_mesh import build_scene, landmark_mesh, write_glb
 from nolbo_ppl.pipeline.thumbnails import LONGEST, best_views, cut, write_crops
+from nolbo_ppl.structures.association_table import AssociationTable
+from nolbo_ppl.structures.detections import Detections
+from nolbo_ppl.structures.landmark import Landmark
 
 
 def slab() -> np.ndarray:
@@ -22,8 +26,10 @@ def slab() -> np.ndarray:
     return grid
 
 
-def row(name: str = "L0", **change: Any) -> dict[str, Any]:
-    return {"name": name, "position": [3.0, 0.5, 8.0], "existence": 0.9, "category": "car", "size": [2.0, 1.0, 2.0], **change}
+def row(name: str = "L0", **change: Any) -> Landmark:
+    """A landmark as a file states it."""
+    stated = {"name": name, "position": [3.0, 0.5, 8.0], "existence": 0.9, "category": "car", "size": [2.0, 1.0, 2.0]}
+    return parse_landmark({**stated, **change}, {})
 
 
 def test_a_landmark_lies_at_its_place_at_its_size() -> None:
@@ -37,7 +43,7 @@ def test_a_landmark_lies_at_its_place_at_its_size() -> None:
 
 def test_a_landmark_without_orientation_stands_upright() -> None:
     """The object's z is up; the world's y is down."""
-    np.testing.assert_allclose(landmark_pose(row())[:3, 2], [0.0, -1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(row().T_world_object[:3, 2], [0.0, -1.0, 0.0], atol=1e-12)
 
 
 def test_the_file_can_be_read_back(tmp_path: Path) -> None:
@@ -70,19 +76,11 @@ def test_an_empty_map_is_a_file_too(tmp_path: Path) -> None:
 
 
 def test_best_views_weigh_probability_objectness_and_size(tmp_path: Path) -> None:
-    seen = [
-        {"frame": 0, "box": [0, 0, 10, 10], "objectness": 0.9},
-        {"frame": 1, "box": [0, 0, 40, 40], "objectness": 0.5},
-        {"frame": 2, "box": [0, 0, 50, 50], "objectness": 0.9},
-        {"frame": 2, "position": [0, 0, 1]},  # from a detector without boxes
-    ]
-    found = [
-        {"landmarks": {"L0": 1.0}},
-        {"landmarks": {"L0": 1.0}},
-        {"landmarks": {"L0": 0.1, "L1": 0.8}},
-        {"landmarks": {"L1": 1.0}},
-    ]
-    views = best_views(seen, found)
+    box = np.array([[0, 0, 10, 10], [0, 0, 40, 40], [0, 0, 50, 50], [np.nan] * 4])  # the last of a detector without boxes
+    seen = Detections.from_arrays([0, 1, 2, 2], np.ones((4, 3)), objectness=[0.9, 0.5, 0.9, 1.0], box=box)
+    row_of, landmark, weight = np.array([0, 1, 2, 2, 3]), np.array([0, 0, 0, 1, 1]), np.array([1.0, 1.0, 0.1, 0.8, 1.0])
+    found = AssociationTable(seen.id, row_of, landmark, weight, np.zeros(4), np.zeros(4))
+    views = best_views(seen, found, ["L0", "L1"])
     assert (views["L0"].frame, views["L1"].frame) == (1, 2)
     assert views["L0"].value == pytest.approx(0.5 * 40)
     read: list[int] = []

@@ -14,9 +14,10 @@ from nolbo_ppl.data.sequences import open_frames
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.odometry import GroundHeight, KnownLengths
 from nolbo_ppl.pipeline.depth_refinement import DepthScale
-from nolbo_ppl.pipeline.perception import DepthPictures, SequenceDepth, StereoPairs, beside, observed_rows
+from nolbo_ppl.pipeline.perception import DepthPictures, SequenceDepth, StereoPairs, beside, observe_sequence
 from nolbo_ppl.pipeline.run_config import RunConfig
 from nolbo_ppl.pipeline.run_inputs import lengths_between, open_drive, scale_of
+from nolbo_ppl.structures.detections import Detections
 from tests.simulated_sequence import CAMERA, SimulatedDrive
 
 
@@ -74,26 +75,24 @@ def test_depth_sharpens_what_is_written(drive: SimulatedDrive, tmp_path: Path) -
     for name in names:
         Image.fromarray(np.full((96, 192), round(5000 * nearest), dtype=np.uint16)).save(tmp_path / name)
 
-    def rows(depth: Any) -> list[dict[str, Any]]:
+    def seen(depth: Any) -> Detections:
         read = [frames.frame(k) for k in busiest].__getitem__
         observe = partial(drive.model.observe, threshold=0.05, batch=2, decode=False)
-        return list(observed_rows(observe, read, names, CAMERA, depth, 2))
+        return observe_sequence(observe, read, names, CAMERA, depth, 2, [0.0, 0.5, 1.0])
 
-    plain = rows(SequenceDepth(frames, busiest))  # plain images bring no depth
-    sharp = rows(DepthPictures([tmp_path / name for name in names], DepthScale(unit=1 / 5000)))
-    assert [row["id"] for row in plain] == [row["id"] for row in sharp]
-    moved = 0
-    for before, after in zip(plain, sharp):
-        if before["position"] == after["position"]:
-            assert before["position_cov"] == after["position_cov"]
-            continue
-        moved += 1
-        assert np.trace(after["position_cov"]) < np.trace(before["position_cov"])
-        turned = np.linalg.norm(np.cross(before["position"], after["position"])) / np.dot(after["position"], after["position"])
+    plain = seen(SequenceDepth(frames, busiest))  # plain images bring no depth
+    sharp = seen(DepthPictures([tmp_path / name for name in names], DepthScale(unit=1 / 5000)))
+    assert plain.id == sharp.id and set(plain.image) <= set(names) and set(plain.time) <= {0.0, 0.5, 1.0}
+    moved = (plain.position != sharp.position).any(axis=1)
+    np.testing.assert_array_equal(plain.position_covariance[~moved], sharp.position_covariance[~moved])
+    for before, after in zip(plain.position_covariance[moved], sharp.position_covariance[moved]):
+        assert np.trace(after) < np.trace(before)
+    for before, after in zip(plain.position[moved], sharp.position[moved]):
+        turned = np.linalg.norm(np.cross(before, after)) / np.dot(after, after)
         assert turned < 0.02  # along the ray, but for what correlates with it
-    assert 0 < moved < len(plain)
-    known = rows(DepthPictures([None, None, None], DepthScale()))
-    assert known == plain
+    assert 0 < moved.sum() < len(plain)
+    known = seen(DepthPictures([None, None, None], DepthScale()))
+    np.testing.assert_array_equal(known.position, plain.position)
 
 
 def test_stereo_pairs_match_left_and_right() -> None:

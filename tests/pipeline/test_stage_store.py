@@ -55,6 +55,12 @@ def test_complete_stages_are_not_done_again(tmp_path: Path) -> None:
     assert shop.ran == ["a", "b", "c"]
 
 
+def test_stages_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", logger="nolbo_ppl"):
+        Workshop(tmp_path).run()
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["a", "b", "c"]
+
+
 def test_an_interrupted_stage_leaves_nothing(tmp_path: Path) -> None:
     shop = Workshop(tmp_path)
     shop.fail = "b"

@@ -11,18 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.geometry.voxels import voxel_centres
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.report import read_run
 from nolbo_ppl.report.em_section import json_script
 from nolbo_ppl.report.loop_section import Loop, find_loops, is_right, loop_scores
 from nolbo_ppl.report.report_plots import map_axes, map_plot, outside
-from nolbo_ppl.report.run_landmarks import RunAssociations
 from nolbo_ppl.report.sections import world_map
 from nolbo_ppl.report.shape_thumbnails import render_shape
 from nolbo_ppl.report.svg import Axes, element, equal_axes, round_ticks
 from nolbo_ppl.report.viewer_objects import ellipsoid
 from nolbo_ppl.report.wording import figures_tables, say
+from nolbo_ppl.structures.association_table import AssociationTable
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-3.7, 12.2), (1e-6, 2e-6), (-1e5, 3e5), (5.0, 5.0)])
@@ -96,16 +97,16 @@ def test_shape_is_drawn_without_holes_where_it_is() -> None:
     assert not nothing.any()
 
 
-def associations(frames: list[int], labels: list[int]) -> RunAssociations:
+def associations(frames: list[int], labels: list[int]) -> AssociationTable:
     rows = np.array([k for k, j in enumerate(labels) if j >= 0])
-    return RunAssociations(
+    return AssociationTable(
         tuple(map(str, range(len(frames)))),
-        np.array(frames),
         rows,
         np.array(labels)[rows],
         np.ones(len(rows)),
         np.zeros(len(frames)),
         np.zeros(len(frames)),
+        np.array(frames),
     )
 
 
@@ -183,9 +184,10 @@ def test_an_outlier_neither_shrinks_nor_covers_the_map(run_folder: Path) -> None
     run = read_run(run_folder)
     plain = map_axes(run)
     assert outside(run, plain) == 0
-    far = replace(run.landmarks[0], position=np.array([500.0, 0.0, 900.0]))
+    far = replace(run.landmarks[0], T_world_object=make_pose(np.eye(3), np.array([500.0, 0.0, 900.0])))
     vague = replace(run.landmarks[1], position_covariance=np.diag([400.0, 1.0, 400.0]))
-    odd = replace(run, landmarks=(far, vague, *run.landmarks[2:]))
+    odd = read_run(run_folder)
+    odd.landmarks = (far, vague, *run.landmarks[2:])
     assert map_axes(odd).scale >= plain.scale and outside(odd, map_axes(odd)) == 1
     drawn = map_plot(odd)
     assert drawn.count('class="ellipse wide"') == 1 and drawn.count('class="ellipse"') == len(run.landmarks) - 1

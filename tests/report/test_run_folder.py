@@ -27,7 +27,10 @@ def test_reads_everything(run_folder: Path) -> None:
     assert len(run.images) == FRAMES and all(path is not None and path.is_file() for path in run.images)
     np.testing.assert_allclose(run.times, 0.3 * np.arange(FRAMES))  # type: ignore[arg-type]
     assert run.associations is not None and run.associations.frame is not None
-    assert (np.diff(run.associations.frame) >= 0).all()
+    in_time = run.associations_in_time
+    assert in_time is not None and in_time.frame is not None and (np.diff(in_time.frame) >= 0).all()
+    whose = dict(zip(run.associations.id, run.associations.landmark_of.tolist()))
+    assert dict(zip(in_time.id, in_time.landmark_of.tolist())) == whose and max(whose.values()) > 0
     assert run.iterations is not None
     np.testing.assert_allclose(run.iterations.T_world_camera[0], drive().odometry, atol=1e-5)
     assert run.crop(run.landmarks[0].name) is not None and run.voxels(run.landmarks[0].name) is not None
@@ -57,13 +60,15 @@ def test_a_crop_cannot_lead_out_of_the_folder(folder: Path) -> None:
         ("slam/landmarks.json", '[{"name": "L0", "position": [1, 2, 3], "existence": "x"}]', "`existence`"),
         ("slam/landmarks.json", '[{"name": "L0", "position": [1, 2, 3], "rotation": [0, 0, 0, 0]}]', "unit quaternion"),
         ("slam/associations.jsonl", '{"landmarks": {}}', "not an association"),
-        ("slam/iterations.npz", "nothing", "not a readable NPZ"),
-        ("slam/landmarks_voxels.npz", "nothing", "not a readable NPZ"),
+        ("slam/iterations.npz", "nothing", "NPZ file cannot be read"),
+        ("slam/landmarks_voxels.npz", "nothing", "NPZ file cannot be read"),
         ("frames.jsonl", '{"frame": 0}', "frames do not match"),
-        ("observations.jsonl", '{"id": "a"}', "`frame` is no row number"),
+        ("observations.jsonl", '{"id": "a"}', "`frame` is missing"),
         ("odometry.txt", "1 0 0 0 0 1 0 0 0 0 1 0", "the odometry does not match"),
         ("truth.txt", "1 0 0 0 0 1 0 0 0 0 1 0", "the truth does not match"),
         ("run.json", "[]", "not a JSON object"),
+        ("run.json", '{"format": 3}', "another format: got 3, expected 1 to 2; update nolbo_ppl"),
+        ("run.json", '{"format": "new"}', "another format"),
     ],
 )
 def test_malformed_files_are_named(folder: Path, name: str, text: str, match: str) -> None:

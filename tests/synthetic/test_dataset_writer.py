@@ -55,10 +55,9 @@ def test_round_trip(source: SceneSource, written: Path) -> None:
         assert batch["present"][row].sum() == len(rendered.labels)
         for slot, label in enumerate(rendered.labels):
             objects += 1
-            record = folder.records[row].objects[slot]
-            assert record.R_camera_object is not None and record.position is not None
-            np.testing.assert_allclose(record.R_camera_object, label.R_camera_object, atol=1e-8)
-            np.testing.assert_allclose(record.position, label.position, atol=1e-6)
+            record = folder.records[row]
+            np.testing.assert_allclose(record.R_camera_object[slot], label.R_camera_object, atol=1e-8)
+            np.testing.assert_allclose(record.position[slot], label.position, atol=1e-6)
             np.testing.assert_allclose(batch["box"][row, slot], label.box, atol=1e-5)
             assert folder.categories[batch["category"][row, slot]] == label.category
             assert folder.instances[batch["instance"][row, slot]] == label.instance

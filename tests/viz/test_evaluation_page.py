@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.evaluation.measure import SceneTruth
 from nolbo_ppl.evaluation.retrieval import RetrievalRecords
 from nolbo_ppl.metrics.detection import match
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.viz.detection_plots import choose_scenes, mistakes, write_detections
 from nolbo_ppl.viz.evaluation_page import LARGE, WORDS, write_page
 from nolbo_ppl.viz.evaluation_plots import draw_retrieval
@@ -48,19 +48,7 @@ class Scenes:
     def __getitem__(self, index):
         image = np.random.default_rng(index).integers(0, 256, (60, 200, 3), dtype=np.uint8)
         box = np.array([[10.0, 10, 50, 40], [60, 10, 100, 40]])
-        return SceneTruth(
-            image,
-            np.array([100.0, 100, 100, 30]),
-            box,
-            np.zeros(2, dtype=int),
-            np.full((2, 3, 3), np.nan),
-            np.full((2, 3), np.nan),
-            np.ones(2, dtype=int),
-            np.ones(2),
-            np.zeros((2, 4), np.uint8),
-            np.full(2, np.nan),
-            np.array([[120.0, 10, 180, 50]]),
-        )
+        return Annotations.from_arrays([100.0, 100, 100, 30], box, ignore=[[120.0, 10, 180, 50]], pixels=image)
 
 
 class Model:

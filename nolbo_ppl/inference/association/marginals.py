@@ -68,6 +68,14 @@ def association_marginals(
 
     Raises:
         InputError: wrong shapes, NaN, plus infinity, or no association possible; names detection and landmark.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> log_likelihood = np.log([[0.8, 0.1], [0.7, 0.1]])  # two detections that look like the first of two landmarks
+        >>> found = nolbo_ppl.association_marginals(log_likelihood, log_null=np.log([0.1, 0.1]))
+        >>> found.weights.round(3)  # which takes one of them only
+        array([[0.485, 0.242],
+               [0.424, 0.273]])
     """
     problem = (log_likelihood, log_null)
     return association_marginals_batch([problem], associator=associator, budget=budget, gate=gate, k=k)[0]

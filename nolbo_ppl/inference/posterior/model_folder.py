@@ -17,12 +17,21 @@ from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
 
+FORMAT = 1
+"""Format of a model's files, kept beside the tensors: a file of a later one is refused, not misread."""
+
 
 def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
     """Load a model: the name of weights in the package (`photo`, `tiny`), or a folder with `model.safetensors` and `config.json`.
 
     Raises:
         InputError: neither is there, or the files are damaged or do not fit each other.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> model = nolbo_ppl.load("tiny")
+        >>> "car" in model.config.categories
+        True
     """
     shipped = Path(str(resources.files("nolbo_ppl"))) / "weights"
     folder = Path(name_or_path)
@@ -39,7 +48,13 @@ def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
     values = read_json(file)
     if not isinstance(values, dict) or "model" not in values:
         raise input_error("not a model configuration", expected='{"model": {...}, ...}', file=file)
-    tensors, _ = load_tensors(weights)
+    tensors, facts = load_tensors(weights)
+    form = facts.get("format", 1)
+    if form not in range(1, FORMAT + 1):
+        expected = f"1 to {FORMAT}"
+        raise input_error(
+            "a model of another format", got=form, expected=expected, do="update nolbo_ppl to read it", file=weights
+        )
     stated = values.get("sha256")
     if stated is not None and stated != file_hash(weights):
         expected = f"SHA-256 {stated}, as config.json says"
@@ -71,6 +86,6 @@ def save(folder: str | PathLike[str], model: Nolbo, calibration: Calibration, me
         name: value.half() if half and value.is_floating_point() and value.dim() > 1 else value
         for name, value in model.state_dict().items()
     }
-    save_tensors(folder / "model.safetensors", tensors, {"format": 1})
+    save_tensors(folder / "model.safetensors", tensors, {"format": FORMAT})
     described = {"model": model.config.to_json(), "calibration": calibration.to_json()}
     write_json(folder / "config.json", {**described, "sha256": file_hash(folder / "model.safetensors"), **meta})

@@ -38,6 +38,15 @@ class ObservationModel:
     Args:
         model: the networks; put into evaluation mode.
         calibration: factors on the guide's posterior.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> model = nolbo_ppl.load("tiny")
+        >>> photograph = np.full((96, 160, 3), 128, dtype=np.uint8)  # nothing to be seen
+        >>> len(model.observe(photograph, intrinsics=[150.0, 150.0, 80.0, 48.0]))
+        0
+        >>> model.decode(model.prior_mean()[:1]).shape  # the shape of the first category's mean
+        (1, 32, 32, 32)
     """
 
     def __init__(self, model: Nolbo, calibration: Calibration | None = None) -> None:

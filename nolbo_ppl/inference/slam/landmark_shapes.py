@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from os import PathLike
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.io.landmarks import Voxels
+from nolbo_ppl.io.landmarks import write_voxels as write_voxels
 from nolbo_ppl.structures.landmark import Landmark
-
-Voxels = tuple[Float[np.ndarray, "v v v"], Float[np.ndarray, "v v v"]]
-"""Mean occupancy probability and its variance, per voxel of the canonical grid."""
 
 
 class LatentDecoder(Protocol):
@@ -51,14 +48,3 @@ def decode_landmarks(
         occupancy = model.decode(landmark.latent + np.sqrt(landmark.latent_variance) * noise)
         out[landmark.name] = occupancy.mean(axis=0), occupancy.var(axis=0, ddof=1)
     return out
-
-
-def write_voxels(path: str | PathLike[str], voxels: Mapping[str, Voxels]) -> None:
-    """Write `<name>/mean` and `<name>/variance` of every landmark as float16 arrays of one NPZ file, atomically."""
-    arrays = {
-        f"{name}/{part}": values.astype(np.float16)
-        for name, pair in voxels.items()
-        for part, values in zip(("mean", "variance"), pair)
-    }
-    with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]

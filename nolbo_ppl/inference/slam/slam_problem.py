@@ -60,7 +60,14 @@ def _check_number(name: str, value: object, low: float, high: float, whole: bool
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """How objects are tracked, associated and mapped. None: estimated from the data."""
+    """How objects are tracked, associated and mapped. None: estimated from the data.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> config = nolbo_ppl.SlamConfig(odometry_translation_ratio=0.02, category_symmetry={"mug": 1, "bottle": 0})
+        >>> config.position_scale is None  # estimated from the data
+        True
+    """
 
     odometry_rotation_scale: float | None = None
     """Standard deviation of each angle of one odometry step, rad."""
@@ -197,7 +204,16 @@ def check_step_covariance(covariance: np.ndarray, steps: int) -> None:
 
 @dataclass(frozen=True)
 class SlamProblem:
-    """Odometry and observations of one drive."""
+    """Odometry and observations of one drive.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> from nolbo_ppl.geometry.pose import make_pose
+        >>> odometry = make_pose(np.tile(np.eye(3), (3, 1, 1)), np.array([[0, 0, 0.0], [0, 0, 1], [0, 0, 2]]))
+        >>> seen = nolbo_ppl.Detections.from_arrays([0, 1, 2], [[1, 0, 6.0], [1, 0, 5], [1, 0, 4]], position_scale=0.1)
+        >>> len(nolbo_ppl.SlamProblem(odometry, seen))
+        3
+    """
 
     odometry: Float[np.ndarray, "n 4 4"]
     """Drifting T_world_camera, one row a frame."""

@@ -24,7 +24,20 @@ from nolbo_ppl.structures.landmark import Landmark
 
 @dataclass(frozen=True)
 class SlamResult:
-    """Trajectory, map, associations and how they came about."""
+    """Trajectory, map, associations and how they came about.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+        >>> rng = np.random.default_rng(0)
+        >>> drive = simulate_drive(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
+
+        >>> result = nolbo_ppl.solve(nolbo_ppl.SlamProblem(drive.odometry, drive.observations))
+        >>> result.pose_covariances(np.array([59])).shape  # of the last pose: rotation, position
+        (1, 6, 6)
+        >>> all(0 <= landmark.existence <= 1 for landmark in result.landmarks)
+        True
+    """
 
     state: SlamState
     """The final state."""
@@ -97,7 +110,7 @@ class SlamResult:
             known = state.features.latent.shape[1] > 0 and state.features.latent_variance[j, 0] < LARGE_VARIANCE
             out.append(
                 Landmark(
-                    index=j,
+                    name=f"L{j}",
                     T_world_object=T,
                     covariance=covariance[j],
                     position_covariance=R @ covariance[j, 3:, 3:] @ R.T,

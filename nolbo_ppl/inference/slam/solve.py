@@ -47,6 +47,16 @@ def solve(
     Raises:
         InputError: malformed input.
         GraphError: GTSAM could not solve the graph; names pose or landmark.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+        >>> rng = np.random.default_rng(0)
+        >>> drive = simulate_drive(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
+
+        >>> result = nolbo_ppl.solve(nolbo_ppl.SlamProblem(drive.odometry, drive.observations))
+        >>> result.T_world_camera.shape, len(result.landmarks) > 5
+        ((60, 4, 4), True)
     """
     config = config or SlamConfig()
     start = time.perf_counter()

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from tqdm import tqdm
 
 from nolbo_ppl.errors import NolboError, input_error
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
 from nolbo_ppl.io.files import read_json_object
 from nolbo_ppl.io.images import is_passed_over
 from nolbo_ppl.io.npz import Npz
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
 from nolbo_ppl.synthetic.assets.obj_file import read_obj
@@ -80,7 +80,7 @@ def load_cad_folder(
     else:
         files = [entry for entry in _list_files(folder) if wanted is None or entry[0] in wanted]
         shapes = []
-        for category, instance, file in tqdm(files, desc="CAD", unit="mesh", disable=None):
+        for category, instance, file in progress_bar(files, "CAD", "mesh"):
             vertices, faces = _read_mesh(file)
             vertices = vertices @ turns[file.suffix.lower()].T
             shapes.append(mesh_to_shape(category, instance, vertices, faces, max_faces, diagonals, file=file))

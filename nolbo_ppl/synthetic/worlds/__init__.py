@@ -1,7 +1,7 @@
 """Drives: generated worlds, a camera on a closed path through them, and the truth of every frame."""
 
 from nolbo_ppl.synthetic.worlds.sequence_folder import DriveSummary, write_drive
-from nolbo_ppl.synthetic.worlds.sequence_reader import DriveFrame, DriveObject, SequenceFolder, read_drive, read_objects
+from nolbo_ppl.synthetic.worlds.sequence_reader import DriveObject, SequenceFolder, read_drive, read_objects
 from nolbo_ppl.synthetic.worlds.world import World, make_world
 from nolbo_ppl.synthetic.worlds.world_config import DriveConfig, drive_preset
 from nolbo_ppl.synthetic.worlds.world_frame import RenderedFrame, render_frame
@@ -9,7 +9,6 @@ from nolbo_ppl.synthetic.worlds.world_frame import RenderedFrame, render_frame
 __all__ = [
     "SequenceFolder",
     "DriveConfig",
-    "DriveFrame",
     "DriveObject",
     "DriveSummary",
     "RenderedFrame",

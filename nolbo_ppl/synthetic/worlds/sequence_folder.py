@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
-from tqdm import tqdm
 
 from nolbo_ppl._version import __version__
 from nolbo_ppl.errors import input_error
@@ -27,6 +26,7 @@ from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.parallel import parallel
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.worlds.world import World, make_world
 from nolbo_ppl.synthetic.worlds.world_config import DriveConfig
 from nolbo_ppl.synthetic.worlds.world_frame import render_frame
@@ -167,7 +167,7 @@ def _render_missing(config: DriveConfig, out: Path, workers: int) -> None:
     missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]
     jobs = [(_write_chunk, (config, out, first, last)) for first, last in missing]
     done = config.frames - sum(last - first for first, last in missing)
-    with tqdm(total=config.frames, initial=done, desc="rendering the drive", unit="frame", disable=None) as bar:
+    with progress_bar(None, "rendering the drive", "frame", total=config.frames, done=done) as bar:
         for number in parallel(jobs, min(workers, len(jobs))):
             bar.update(number)
 

@@ -17,9 +17,10 @@ from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.fields import is_number, is_whole, number_array
 from nolbo_ppl.io.files import read_json, read_json_object, read_jsonl
 from nolbo_ppl.io.npz import read_voxels
-from nolbo_ppl.io.scenes import ObjectRecord, image_field, parse_record
+from nolbo_ppl.io.scenes import image_field, parse_record
 from nolbo_ppl.io.text import read_times
 from nolbo_ppl.io.trajectories import read_trajectory
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.worlds.sequence_folder import DRIVE, INTRINSICS, OBJECTS, SCENES, TIMES, TRUTH, VOXELS, read_image
 
 
@@ -41,16 +42,6 @@ class DriveObject:
 
 
 @dataclass(frozen=True)
-class DriveFrame:
-    """What one frame shows."""
-
-    image: Path
-    ids: tuple[str, ...]
-    objects: tuple[ObjectRecord, ...]
-    """In the order of `ids`."""
-
-
-@dataclass(frozen=True)
 class SequenceFolder:
     """A drive folder."""
 
@@ -61,7 +52,8 @@ class SequenceFolder:
     T_world_camera: Float[np.ndarray, "n 4 4"]
     times: Float[np.ndarray, " n"]
     objects: tuple[DriveObject, ...]
-    frames: tuple[DriveFrame, ...]
+    frames: tuple[Annotations, ...]
+    """What each frame shows; every object has the `id` of `objects`."""
     facts: dict[str, Any]
     """The content of `drive.json`."""
 
@@ -70,7 +62,9 @@ class SequenceFolder:
 
     def image(self, frame: int) -> UInt8[np.ndarray, "h w 3"]:
         """The image of a frame."""
-        return read_image(self.frames[frame].image)
+        file = self.frames[frame].file
+        assert file is not None  # it was found when the folder was read
+        return read_image(file)
 
     def voxels(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         """Packed 32^3 occupancy of each instance; see `nolbo_ppl.geometry.voxels.unpack_voxels`."""
@@ -149,13 +143,12 @@ def read_drive(path: str | os.PathLike[str]) -> SequenceFolder:
     return SequenceFolder(path, intrinsics, size, poses, times, objects, frames, read_json_object(path / DRIVE))
 
 
-def _frames(path: Path, size: tuple[int, int], known: set[str]) -> list[DriveFrame]:
+def _frames(path: Path, size: tuple[int, int], known: set[str]) -> list[Annotations]:
     file, frames = path / SCENES, []
     for line, row in read_jsonl(file):
         record = parse_record(row, file, line, CATEGORIES, size, image_field(row, path, file, line))
-        ids = tuple(str(thing.get("id")) for thing in row["objects"])
-        unknown = [name for name in ids if name not in known]
+        unknown = [str(name) for name in record.id if name not in known]
         if unknown:
             raise input_error("id", got=unknown[0], expected=f"one of {OBJECTS}", file=file, line=line)
-        frames.append(DriveFrame(record.image, ids, record.objects))
+        frames.append(record)
     return frames

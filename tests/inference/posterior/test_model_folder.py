@@ -11,7 +11,7 @@ import torch
 
 import nolbo_ppl
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.posterior.model_folder import load, save
+from nolbo_ppl.inference.posterior.model_folder import FORMAT, load, save
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.tensors import file_hash, load_tensors, save_tensors
 from nolbo_ppl.models.posterior_calibration import Calibration
@@ -105,3 +105,18 @@ def test_weights_that_were_exchanged_are_noticed(tmp_path: Path) -> None:
 def test_shipped_weights_state_their_hash() -> None:
     for file in (Path(nolbo_ppl.__file__).parent / "weights").glob("*/config.json"):
         assert json.loads(file.read_text())["sha256"] == file_hash(file.with_name("model.safetensors")), file
+
+
+def test_the_format_of_the_weights_is_read(tmp_path: Path) -> None:
+    saved(tmp_path)
+    tensors, facts = load_tensors(tmp_path / "model.safetensors")
+    assert facts == {"format": FORMAT}
+    save_tensors(tmp_path / "model.safetensors", tensors, {})  # before there was a number, or none was written
+    load(tmp_path)
+    described = json.loads((tmp_path / "config.json").read_text())
+    del described["sha256"]
+    (tmp_path / "config.json").write_text(json.dumps(described))
+    for stated in (FORMAT + 1, 0, "new"):
+        save_tensors(tmp_path / "model.safetensors", tensors, {"format": stated})
+        with pytest.raises(InputError, match=r"model.safetensors: a model of another format: .*update nolbo_ppl"):
+            load(tmp_path)

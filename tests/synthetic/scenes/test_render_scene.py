@@ -282,7 +282,7 @@ def test_photographs_lie_behind_the_objects(tmp_path) -> None:
     with pytest.raises(InputError, match="no such folder of pictures"):
         SceneSource(config, backgrounds=str(tmp_path / "absent")).scene(0)
     (tmp_path / "empty" / "broken.jpg").write_bytes(b"not a picture")
-    with pytest.raises(InputError, match=r"broken.jpg: not a readable picture"):
+    with pytest.raises(InputError, match=r"broken.jpg: not a readable image"):
         SceneSource(config, backgrounds=str(tmp_path / "empty")).scene(0)
 
 

@@ -75,12 +75,12 @@ def test_read_back(written: Path) -> None:
     checked = 0
     for k, frame in enumerate(drive.frames):
         T_camera_world = inverse(drive.T_world_camera[k])
-        for name, record in zip(frame.ids, frame.objects, strict=True):
+        for i, name in enumerate(frame.id):
+            assert name is not None
             T = T_camera_world @ things[name].T_world_object
-            assert record.position is not None and record.R_camera_object is not None
-            np.testing.assert_allclose(record.position, T[:3, 3], atol=2e-5)
-            np.testing.assert_allclose(record.R_camera_object, T[:3, :3], atol=1e-6)
-            assert record.category == things[name].category
+            np.testing.assert_allclose(frame.position[i], T[:3, 3], atol=2e-5)
+            np.testing.assert_allclose(frame.R_camera_object[i], T[:3, :3], atol=1e-6)
+            assert frame.category[i] == things[name].category
             checked += 1
     assert checked > 20
     # Gravity: the ground's normal, and the height of the camera above it.
@@ -91,7 +91,7 @@ def test_read_back(written: Path) -> None:
 
 def test_a_drive_is_also_a_folder_of_scenes(written: Path) -> None:
     scenes = SceneFolder(written, size=96)
-    assert len(scenes) == 18 and len(scenes.records[0].objects) == len(read_drive(written).frames[0].objects)
+    assert len(scenes) == 18 and len(scenes.records[0]) == len(read_drive(written).frames[0])
 
 
 def test_stopped_runs_go_on(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +156,7 @@ def test_malformed_objects(written: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"true objects: got dict, expected a list"):
         read_drive(out)
     write_json(out / "objects.json", good[1:])
-    if any(good[0]["id"] in frame.ids for frame in read_drive(written).frames):
+    if any(good[0]["id"] in frame.id for frame in read_drive(written).frames):
         with pytest.raises(InputError, match=r"scenes\.jsonl:\d+: id: got O0, expected one of objects\.json"):
             read_drive(out)
 

@@ -64,6 +64,18 @@ class IncrementalSlam(OnlineMemory):
 
     Scales that the configuration does not state are taken from a reference problem (the first part of a drive, or an
     earlier one of the same sensors) given as `calibration`; without one they are the defaults.
+
+    Example:
+        >>> import nolbo_ppl
+        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+        >>> rng = np.random.default_rng(0)
+        >>> drive = simulate_drive(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
+
+        >>> slam = nolbo_ppl.IncrementalSlam()
+        >>> for frame, pose in enumerate(drive.odometry[:10]):
+        ...     info = slam.update(pose, drive.observations.select(drive.observations.frame == frame))
+        >>> info.frame, info.T_world_camera.shape
+        (9, (4, 4))
     """
 
     def __init__(
