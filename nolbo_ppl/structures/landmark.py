@@ -54,6 +54,8 @@ class Landmark:
     """Last frame it was detected in."""
     category: str | None = None
     """Most probable category; that of `class_posterior` where it is not given."""
+    index: int = -1
+    """Its number in the graph of SLAM; -1 when it was read from a file."""
 
     def __post_init__(self) -> None:
         if self.category is None and self.class_posterior:

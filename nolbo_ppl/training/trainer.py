@@ -132,7 +132,7 @@ def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dic
         file = config.out / f"evidence_{'held_out' if held_out else 'train'}.safetensors"
         if file.is_file():  # a run that is resumed need not gather again
             return table_of(load_tensors(file)[0])
-        batches = tqdm(data.plain(held_out, config.evidence_scenes), desc="evidence", unit="batch", disable=None)
+        batches = progress_bar(data.plain(held_out, config.evidence_scenes), "evidence", "batch")
         table = join_tables(gather_table(guide, batch) for batch in batches)
         save_tensors(file, table_tensors(table), {})
         return table

@@ -111,6 +111,7 @@ class SlamResult:
             out.append(
                 Landmark(
                     name=f"L{j}",
+                    index=j,
                     T_world_object=T,
                     covariance=covariance[j],
                     position_covariance=R @ covariance[j, 3:, 3:] @ R.T,

@@ -43,6 +43,7 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
         known = len(variance[row]) > 0 and bool(variance[row, 0] < LARGE_VARIANCE)
         out.append(
             Landmark(
+                name=f"L{landmark.number}",
                 index=landmark.number,
                 T_world_object=T,
                 covariance=covariance,
