@@ -97,6 +97,6 @@ def test_images_and_shapes_must_be_those_of_the_drive(drive: SimulatedDrive, tmp
         read_truth(drive.folder, ["000000.png", "other.png"])
     folder = tmp_path / "drive"
     shutil.copytree(drive.folder, folder)
-    np.savez(folder / "voxels.npz", something=np.zeros(3, dtype=np.uint8))
+    np.savez(folder / "voxels.npz", something=np.zeros(4096, dtype=np.uint8))
     with pytest.raises(InputError, match="a true shape is missing"):
         read_truth(folder, names(drive))

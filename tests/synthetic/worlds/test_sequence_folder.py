@@ -169,7 +169,7 @@ def test_malformed_files(written: Path, tmp_path: Path) -> None:
         read_drive(out)
     write_jsonl(out / "scenes.jsonl", rows)
     (out / "times.txt").write_text("soon\n")
-    with pytest.raises(InputError, match=r"times\.txt: times"):
+    with pytest.raises(InputError, match=r"times\.txt:1: not a time"):
         read_drive(out)
     write_json(out / "intrinsics.json", {"fx": 1})
     with pytest.raises(InputError, match=r"intrinsics\.json: intrinsics: got"):
