@@ -172,7 +172,7 @@ def test_malformed_files(written: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"times\.txt:1: not a time"):
         read_drive(out)
     write_json(out / "intrinsics.json", {"fx": 1})
-    with pytest.raises(InputError, match=r"intrinsics\.json: intrinsics: got"):
+    with pytest.raises(InputError, match=r"intrinsics\.json: intrinsics: fy: got"):
         read_drive(out)
     with pytest.raises(InputError, match="not a complete drive"):
         read_drive(tmp_path / "absent")
