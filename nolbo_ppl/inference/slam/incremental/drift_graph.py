@@ -62,8 +62,16 @@ class DriftGraph:
         self.local = self.local + (carry * np.repeat([rotation**2, translation**2], 3)) @ carry.T
         self.since += 1
         self.steps += 1
-        if self.since < self.stride:
-            return
+        if self.since >= self.stride:
+            self._new_node()
+
+    def restart(self, T_world_camera: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]) -> None:
+        """Another drive begins on this map: a node at a pose known with a covariance in the camera's frame."""
+        carry = adjoint(T_world_camera)
+        self.here, self.local = 0, carry @ covariance @ carry.T
+        self._new_node()
+
+    def _new_node(self) -> None:
         self.parent.append(self.here)
         self.gaps.append(self.local)
         self.standing.append(len(self.gaps) - 1)

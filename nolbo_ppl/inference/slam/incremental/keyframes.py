@@ -43,6 +43,11 @@ class KeyframeKeeper:
         self.stretch: list[int] = []
         self.known: dict[int, int] = {}
         self.condensed: list[int] = []
+        self.start = 0
+
+    def restart(self, frame: int) -> None:
+        """Another drive begins at this keyframe: the window of the last one stays as it is."""
+        self.start, self.stretch, self.known = frame, [], {}
 
     def saw(self, frame: int, met: list[bool]) -> None:
         """Note how many landmarks met again a keyframe sees."""
@@ -51,7 +56,7 @@ class KeyframeKeeper:
     def advance(self, frame: int, graph: IncrementalGraph) -> None:
         """One more keyframe: what leaves the window may be condensed."""
         leaving = frame - self.config.window
-        if leaving < 1:
+        if leaving <= self.start:
             return
         self.stretch.append(leaving)
         if len(self.stretch) < self.config.stretch:

@@ -39,6 +39,8 @@ class OnlineMemory:
         self.graph = IncrementalGraph()
         self.keeper = KeyframeKeeper(keyframes)
         self.T_world_camera = np.eye(4)
+        self.drives = 1
+        self.beginning: tuple[np.ndarray, np.ndarray] | None = None
 
     def new_tracker(self) -> Tracker:
         """A tracker without tracks, under the scales in use."""

@@ -109,9 +109,10 @@ class IncrementalSlam(OnlineMemory):
         if odometry.shape != (4, 4) or not np.isfinite(odometry).all() or not is_rotation(odometry[:3, :3]):
             raise input_error("odometry is no pose", got=odometry, expected="a finite 4 x 4 rigid motion")
         frame = self.frames
-        if frame and odometry_covariance is not None:
+        steps = frame and self.beginning is None
+        if steps and odometry_covariance is not None:
             check_step_covariance(np.asarray(odometry_covariance)[None], 1)
-        if frame > 1 and (odometry_covariance is not None) != self.stated:
+        if steps and self.stated is not None and (odometry_covariance is not None) != self.stated:
             raise input_error("odometry_covariance is given for some keyframes only", do="give it for all or for none")
         table = replace(observations, frame=np.zeros(len(observations), dtype=np.int64))
         problem = SlamProblem(odometry[None], table)  # checks the detections
@@ -164,6 +165,12 @@ class IncrementalSlam(OnlineMemory):
         if frame == 0:
             self.T_world_camera = odometry
             self.graph.add_first_pose(odometry)
+            return 0.0, 0.0
+        if self.beginning is not None:
+            self.T_world_camera, spread = self.beginning
+            self.beginning = None
+            self.graph.add_first_pose(self.T_world_camera, spread)
+            self.loops.drift.restart(self.T_world_camera, spread)
             return 0.0, 0.0
         step = inverse(self.last_odometry) @ odometry
         self.stated = covariance is not None
@@ -315,6 +322,31 @@ class IncrementalSlam(OnlineMemory):
         self.loops.flush(self.frames - 1, self.graph)
         return map_landmarks(self.loops.map, self.graph, self.config)
 
+    def begin(self, T_world_camera: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]) -> None:
+        """Begin another drive on this map, yesterday's as the prior of today's: the next keyframe is its first one.
+
+        Its odometry may start anywhere. Landmarks are met again as far as the covariance allows: by single tracks within five
+        scales of a detection, by constellations beyond. `finish` is for one drive alone.
+
+        Args:
+            T_world_camera: where the drive begins, in the frame of the map.
+            covariance: of that pose, [rotation rad, position m] in the camera's frame.
+
+        Raises:
+            InputError: no map yet, no pose, or no covariance.
+        """
+        self._started()
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        if T.shape != (4, 4) or not np.isfinite(T).all() or not is_rotation(T[:3, :3]):
+            raise input_error("the beginning is no pose", got=T, expected="a finite 4 x 4 rigid motion")
+        spread = np.asarray(covariance, dtype=np.float64)
+        check_step_covariance(spread[None], 1)
+        self.beginning, self.drives = (T, spread), self.drives + 1
+        total = self.tracker.total if self.tracker is not None else 0
+        self.tracker, self.tracks, self.stated = self.new_tracker(), {}, None
+        self.tracker.total = total
+        self.keeper.restart(self.frames)
+
     def save(self, path: str | PathLike[str]) -> None:
         """Write everything to one NPZ file; `load` goes on from it bit for bit as this system does from here.
 
@@ -353,9 +385,11 @@ class IncrementalSlam(OnlineMemory):
         """Batch EM on the tracks gathered: the final trajectory and map.
 
         Raises:
-            InputError: no keyframe was given, or the history was not kept.
+            InputError: no keyframe was given, the history was not kept, or there were several drives.
         """
         self._started()
+        if self.drives > 1:
+            raise input_error("the map holds several drives", got=self.drives, do="use trajectory() and landmarks()")
         if not self.keyframes.history:
             raise input_error("the history was not kept", do="use trajectory() and landmarks(), or KeyframeConfig(history=True)")
         covariance = np.array(self.step_covariances) if self.step_covariances else None

@@ -55,6 +55,8 @@ MEASUREMENTS = tuple(f.name for f in fields(Measurements) if f.name != "modes")
 
 def save_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
     """Write a system that has taken at least one keyframe."""
+    if slam.beginning is not None:
+        raise input_error("a drive was begun that has no keyframe yet", do="call update first")
     slam.graph.rebuild()
     arrays: dict[str, Any] = {}
     meta: dict[str, Any] = {
@@ -63,6 +65,7 @@ def save_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
         "keyframes": asdict(slam.keyframes),
         "frames": slam.frames,
         "stated": slam.stated,
+        "drives": slam.drives,
         "factors": [slam.scales.position_factor, slam.scales.range_factor, slam.scales.rotation_factor],
         "categories": list(slam.prior.categories),
         "category_error": slam.prior.category_error,
@@ -78,6 +81,7 @@ def save_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
         "stretch": slam.keeper.stretch,
         "known": sorted(slam.keeper.known.items()),
         "condensed": slam.keeper.condensed,
+        "start": slam.keeper.start,
     }
     _put_history(slam, arrays, meta)
     arrays["meta"] = np.array(json.dumps(meta))
@@ -100,7 +104,7 @@ def load_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
                 config[name] = tuple(config[name])
             slam.config = SlamConfig(**config)
             slam.keyframes = KeyframeConfig(**meta["keyframes"])
-            slam.frames, slam.stated = int(meta["frames"]), meta["stated"]
+            slam.frames, slam.stated, slam.drives = int(meta["frames"]), meta["stated"], int(meta["drives"])
             slam.prior = FeaturePrior(
                 archive.array("prior/mean", (None,)),
                 archive.array("prior/variance", (None,)),
@@ -119,6 +123,7 @@ def load_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
             keeper = KeyframeKeeper(slam.keyframes)
             keeper.stretch, keeper.condensed = list(meta["keeper"]["stretch"]), list(meta["keeper"]["condensed"])
             keeper.known = {int(t): int(n) for t, n in meta["keeper"]["known"]}
+            keeper.start = int(meta["keeper"]["start"])
             slam.keeper = keeper
             _get_history(slam, archive, meta)
             slam.graph = _get_graph(archive, meta)

@@ -9,6 +9,7 @@ import pytest
 
 from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.errors import InputError
+from nolbo_ppl.geometry.pose import inverse, se3_exp
 from nolbo_ppl.inference.slam import IncrementalSlam, SlamConfig, SlamProblem
 from nolbo_ppl.io.npz import Npz, save_npz
 
@@ -67,3 +68,28 @@ def test_files_of_another_kind_are_refused(halfway: tuple[SimulatedSequence, Inc
             IncrementalSlam.load(other)
     with pytest.raises(InputError, match="no keyframe"):
         IncrementalSlam().save(other)
+
+
+def test_the_map_of_yesterday_is_the_prior_of_today(halfway: tuple[SimulatedSequence, IncrementalSlam, Path]) -> None:
+    """Another drive round the same objects from a pose known to 0.7 m and 3 degrees, its odometry in a frame of its own."""
+    drive, _, path = halfway
+    slam, table = IncrementalSlam.load(path), drive.observations
+    before, rng = len(slam.landmarks()), np.random.default_rng(5)
+    scale = np.repeat([0.05, 0.7], 3)
+    slam.begin(drive.truth[20] @ se3_exp(scale * rng.normal(size=6)), np.diag(scale**2))
+    with pytest.raises(InputError, match="no keyframe yet"):
+        slam.save(path.with_name("begun.npz"))
+    met = 0
+    for t in range(20, 70):
+        info = slam.update(inverse(drive.odometry[20]) @ drive.odometry[t], table.select(table.frame == t))
+        met += info.met
+    assert info.frame == 129 and met >= 10 and info.landmarks <= 1.1 * before
+    assert np.linalg.norm(info.T_world_camera[:3, 3] - drive.truth[69, :3, 3]) < 0.6
+    assert slam.trajectory().shape == (130, 4, 4)
+    with pytest.raises(InputError, match="several drives"):
+        slam.finish()
+    slam.save(path.with_name("twice.npz"))
+    again = IncrementalSlam.load(path.with_name("twice.npz"))
+    np.testing.assert_array_equal(again.trajectory(), slam.trajectory())
+    with pytest.raises(InputError, match="no pose"):
+        slam.begin(np.zeros((4, 4)), np.eye(6))
