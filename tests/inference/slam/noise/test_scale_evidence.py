@@ -127,3 +127,19 @@ def test_residuals_of_a_right_model_have_unit_width() -> None:
     told = np.mean(found.observation_expected[:, 3:] ** 2, axis=2)
     assert abs(np.sum(position**2) / np.sum(told) - 1) < 5 * np.sqrt(2 / np.sum(told))
     assert not found.observation[:, :3].any()  # nobody observed an orientation
+
+
+def test_understated_odometry_is_reported_and_raised() -> None:
+    """Scales stated 20 times too small: found within a factor of two, said, and left alone where nothing is to be corrected."""
+    from nolbo_ppl.inference.slam.noise.odometry_noise import raise_stated
+
+    right = SlamConfig(odometry_rotation_scale=0.02, odometry_translation_ratio=0.02)
+    state = solved(4, 60, 0.02, right)
+    assert raise_stated(state, (True, True)).noise.warnings == state.noise.warnings
+    wrong = SlamConfig(odometry_rotation_scale=0.001, odometry_translation_ratio=0.02)
+    state = solved(4, 60, 0.02, wrong)
+    raised = raise_stated(state, (True, True)).noise
+    assert any("odometry rotation scale is too small" in w for w in raised.warnings)
+    assert 0.5 < raised.rotation_step[0] / 0.02 < 2
+    only_said = raise_stated(replace(state, config=replace(wrong, correct_scales=False)), (True, True)).noise
+    assert only_said.rotation_step[0] == 0.001 and only_said.warnings == raised.warnings
