@@ -80,14 +80,12 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
 
 
 def odometry_by_evidence(state: SlamState) -> SlamState:
-    """Scales of the odometry that the tracked objects make probable, where nobody stated them; a stated one that is too small.
+    """Scales of the odometry that the tracked objects make probable, where nobody stated them.
 
     Before loops close the evidence often bounds a scale from above alone. The one in use is then a standard deviation above
     the posterior's mean: too wide a drift is annealed away as loops close, too narrow a one closes none.
     """
     free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
-    if not all(free):
-        state = raise_stated(state, (not free[0], not free[1]))
     window = densest_window(state)
     if not any(free) or len(window.rows) < 20 or len(window.problem) < 10:
         return state
