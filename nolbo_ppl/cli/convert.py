@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,8 +22,16 @@ from nolbo_ppl.data.converters import (
     read_photographs,
     write_converted,
 )
-from nolbo_ppl.io.files import read_json_object
+from nolbo_ppl.data.converters.foreign_detections import DetectionFormat, observations_of, read_foreign_detections
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.distortion import undistort_boxes
+from nolbo_ppl.io.camera_files import read_camera
+from nolbo_ppl.io.fields import number_array
+from nolbo_ppl.io.files import read_json, read_json_object, write_json
+from nolbo_ppl.io.images import images_of
+from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.io.output_folder import output_folder
+from nolbo_ppl.io.text import read_words
 from nolbo_ppl.io.trajectories import COVARIANCE
 
 
@@ -168,8 +176,53 @@ class YcbvSlam:
         )
 
 
+@dataclass(frozen=True)
+class ForeignFile:
+    """Detections of another detector (COCO, YOLO, KITTI, Omni3D, OA-SLAM) as observations for `nolbo slam`."""
+
+    data: Path
+    """The file; of YOLO and KITTI also the folder of files."""
+    format: DetectionFormat
+    """Its format."""
+    intrinsics: Path
+    """The camera (see `nolbo run --intrinsics`); a distortion is taken out of the boxes."""
+    out: Path
+    """Folder for observations.jsonl."""
+    images: Path | None = None
+    """Folder of the images, whose order gives their numbers; else the order of the names in the file."""
+    names: Path | None = None
+    """Names of the categories, one a line, in order of their numbers; COCO's by default."""
+    heights: Path | None = None
+    """JSON: height and standard deviation, m, by category; everyday values by default. Boxes alone need them."""
+    minimum_score: float = 0.3
+    """Detections below are left out."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        camera = read_camera(self.intrinsics)
+        size = (camera.width, camera.height) if camera.width and camera.height else None
+        heights = None
+        if self.heights is not None:
+            given = read_json(self.heights)
+            values = number_array(list(given.values()) if isinstance(given, dict) else None, (None, 2))
+            if values is None or not (values > 0).all():
+                raise input_error("heights", expected='{"category": [height, standard deviation], ...} in m', file=self.heights)
+            heights = {name: (float(h), float(s)) for name, (h, s) in zip(given, values)}
+        names = None if self.names is None else [" ".join(words) for _, words in read_words(self.names)]
+        images = None if self.images is None else [path.name for path in images_of(self.images)]
+        found = read_foreign_detections(self.data, self.format, images=images, names=names, size=size)
+        if camera.model is not None:
+            found = replace(found, box=undistort_boxes(found.box, camera.vector, camera.model, camera.distortion))
+        table, left_out = observations_of(found, camera.vector, size, heights, self.minimum_score)
+        write_observations(self.out / "observations.jsonl", table)
+        write_json(self.out / "source.json", {"kind": "detections", "format": self.format, "left_out": left_out})
+        reasons = "".join(f", {count} left out {why}" for why, count in left_out.items() if count)
+        return f"{len(table)} of {len(found)} detections{reasons},"
+
+
 Source = (
-    Annotated[KittiObject, tyro.conf.subcommand("kitti-object")]
+    Annotated[ForeignFile, tyro.conf.subcommand("detections")]
+    | Annotated[KittiObject, tyro.conf.subcommand("kitti-object")]
     | Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
     | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
     | Annotated[Photographs, tyro.conf.subcommand("photographs")]
@@ -195,7 +248,8 @@ def is_converted(folder: Path) -> bool:
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
     source: Any = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
-    with output_folder(source.out, SCENES if hasattr(source, "write") else DRIVE, is_own=is_converted) as folder:
+    names = SCENES if hasattr(source, "write") and not isinstance(source, ForeignFile) else DRIVE
+    with output_folder(source.out, names, is_own=is_converted) as folder:
         if hasattr(source, "write"):
             written = dataclasses.replace(source, out=folder).write()
         else:

@@ -25,6 +25,8 @@ class StepFlag(IntFlag):
     """The matches turn about the camera without parallax: rotation measured, direction of translation as before."""
     NO_SCALE = 8
     """No ground was found: the length before is repeated."""
+    TWIN = 16
+    """All matches lie on one plane, which allows two motions: the likelier one, with a covariance that holds both."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -14,6 +15,7 @@ from nolbo_ppl.odometry.epipolar import TwoView, rays, tangent, two_view
 from nolbo_ppl.odometry.ground_scale import LengthBelief, fit_ground, next_length
 from nolbo_ppl.odometry.keypoints import Features, detect, grey, match, track
 from nolbo_ppl.odometry.odometry_config import GroundHeight, KnownLengths, OdometryConfig, Scale, StepFlag
+from nolbo_ppl.odometry.planar_scene import PLANAR_SHARE, PlaneMotion, plane_inliers, plane_motions, twin_covariance
 from nolbo_ppl.odometry.pure_rotation import parallax_share, rotation_only
 from nolbo_ppl.progress import progress_bar
 
@@ -74,6 +76,8 @@ class OdometryState:
     """Direction of the last translation that was measured."""
     length: LengthBelief | None = None
     """Length of the step before, where the ground gives the scale."""
+    normal: Float[np.ndarray, " 3"] | None = None
+    """Normal of the plane that was all the step before saw, in this camera."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ class Step:
     """Those that obey the motion."""
     flags: StepFlag
     """What it lacked."""
+    normal: Float[np.ndarray, " 3"] | None = None
+    """Normal of the plane in the later camera, where the scene is one."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +196,12 @@ def turning_step(
 
 
 def scaled_step(
-    setup: VisualOdometry, state: OdometryState, view: TwoView, first: np.ndarray, second: np.ndarray
+    setup: VisualOdometry,
+    state: OdometryState,
+    view: TwoView,
+    first: np.ndarray,
+    second: np.ndarray,
+    planar: Sequence[PlaneMotion] = (),
 ) -> tuple[Step, LengthBelief | None]:
     """A step whose rotation and direction are measured, given its length; also what is known of the length."""
     flags, belief = StepFlag.OK, None
@@ -204,7 +215,21 @@ def scaled_step(
         length_scale = setup.scale.scale(length)
     covariance = step_covariance(view.covariance * setup.config.inflation**2, view.R, view.direction, length, length_scale)
     pose = make_pose(view.R, length * view.direction)
-    return Step(pose, covariance, len(first), int(view.inliers.sum()), flags), belief
+    doubted = twin_covariance(planar, length) if planar else None
+    if doubted is not None:
+        covariance, flags = covariance + doubted, flags | StepFlag.TWIN
+    normal = planar[0].normal if planar else None
+    return Step(pose, covariance, len(first), int(view.inliers.sum()), flags, normal), belief
+
+
+def plane_of(
+    setup: VisualOdometry, state: OdometryState, view: TwoView, first: np.ndarray, second: np.ndarray
+) -> list[PlaneMotion]:
+    """The motions a scene of one plane allows, the likelier first; empty where the scene is more than a plane."""
+    plane = plane_inliers(first, second, setup.config, view.scale)
+    if plane is None or np.mean(plane[1][view.inliers]) < PLANAR_SHARE:
+        return []
+    return plane_motions(plane[0], first, second, setup.intrinsics, setup.config, view, state.normal, state.direction)
 
 
 def motion(
@@ -236,7 +261,8 @@ def motion(
         return turning_step(setup, state, R, covariance, scale, len(first), StepFlag.ROTATION), state.length
     if view is None:
         return repeated_step(setup, state, len(first)), state.length
-    return scaled_step(setup, state, view, ray_first, ray_second)
+    planar = plane_of(setup, state, view, first, second)
+    return scaled_step(setup, state, planar[0].view if planar else view, ray_first, ray_second, planar)
 
 
 def step(setup: VisualOdometry, state: OdometryState, image: UInt8[np.ndarray, "h w 3"]) -> tuple[OdometryState, Step]:
@@ -266,7 +292,7 @@ def step(setup: VisualOdometry, state: OdometryState, image: UInt8[np.ndarray, "
     if measured and np.linalg.norm(translation) > 0:
         direction = translation / np.linalg.norm(translation)
     pose = chain(state.T_world_camera, taken.T_earlier_later[None])[1]
-    after = OdometryState(state.frame + 1, pose, picture, features, taken.T_earlier_later, direction, length)
+    after = OdometryState(state.frame + 1, pose, picture, features, taken.T_earlier_later, direction, length, taken.normal)
     return after, taken
 
 

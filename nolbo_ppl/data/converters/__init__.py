@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from nolbo_ppl.data.converters.converted import Converted, write_converted
+from nolbo_ppl.data.converters.foreign_detections import observations_of, read_foreign_detections
 from nolbo_ppl.data.converters.kitti_object import convert_kitti_object
 from nolbo_ppl.data.converters.kitti_poles import convert_kitti_poles
 from nolbo_ppl.data.converters.kitti_tracking import convert_kitti_tracking
@@ -18,5 +19,7 @@ __all__ = [
     "convert_photographs",
     "convert_ycbv_slam",
     "read_photographs",
+    "observations_of",
+    "read_foreign_detections",
     "write_converted",
 ]
