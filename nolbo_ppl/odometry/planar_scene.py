@@ -107,8 +107,8 @@ def plane_motions(
             continue
         if np.mean(ray_second @ n[:, 0] > 0) < 1 - BEHIND_SHARE:  # the plane lies behind the later camera
             continue
-        start = (R, t[:, 0] / length)
-        views.append((refine(*start, ray_first, ray_second, intrinsics, config.threshold), start))
+        direction_of = t[:, 0] / length
+        views.append((refine(R, direction_of, ray_first, ray_second, intrinsics, config.threshold), (R, direction_of)))
     found: list[PlaneMotion] = []
     for view, beginning in views:
         if view.inliers.sum() < config.least_inliers:
