@@ -6,8 +6,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # One thread a process: torch's OpenMP threads spin and slow each other down on busy or small machines.
 TEST_WORKERS ?= 2
+# Time of `make fuzz`; hours find more.
+FUZZ_SECONDS ?= 600
 
-.PHONY: setup demo train test lint wheel bench bench-gate docs clean
+.PHONY: setup demo train test lint wheel bench bench-gate docs clean fuzz
 
 setup: $(STAMP)
 
@@ -47,6 +49,9 @@ bench: $(STAMP)
 
 bench-gate: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/gate.py
+
+fuzz: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py --seconds $(FUZZ_SECONDS) --out build/fuzz.json
 
 docs: $(STAMP)
 	OMP_NUM_THREADS=1 NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

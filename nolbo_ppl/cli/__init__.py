@@ -82,7 +82,7 @@ def system_message(error: OSError) -> str:
     """What the system says about a file: its name and why."""
     reason = error.strerror or str(error) or type(error).__name__
     names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes | os.PathLike)]
-    return ": ".join([" -> ".join(names), reason] if names else [reason])
+    return ": ".join([" -> ".join(dict.fromkeys(names)), reason] if names else [reason])
 
 
 def _end(verb: str, message: str, status: int) -> SystemExit:

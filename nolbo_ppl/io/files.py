@@ -52,6 +52,14 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def is_file(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a regular file; false, too, for names that no file can have."""
+    try:
+        return Path(path).is_file()
+    except OSError:
+        return False
+
+
 def inside(folder: str | os.PathLike[str], name: str, *, follow: bool = False) -> Path | None:
     """Path of a name within a folder, None where it leads out of it: by `..`, as an absolute path, or over a link.
 
@@ -89,7 +97,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         if error.filename in (None, str(temporary), os.fspath(temporary)):
-            error.filename, error.filename2 = str(path), None  # a full disk is told without any name
+            error.filename = str(path)  # a full disk is told without any name
         raise
     finally:
         temporary.unlink(missing_ok=True)

@@ -195,5 +195,5 @@ def read_npy(path: str | os.PathLike[str], shape: Shape, largest: int = LARGEST_
 
 def save_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True) -> None:
     """Write arrays as one NPZ file, atomically."""
-    with atomic_path(path) as temporary:
-        (np.savez_compressed if compressed else np.savez)(temporary, **arrays)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        (np.savez_compressed if compressed else np.savez)(file, **arrays)

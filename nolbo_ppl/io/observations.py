@@ -20,6 +20,7 @@ import numpy as np
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import quaternion_to_matrix
+from nolbo_ppl.io.fields import is_number, is_whole, number_array
 from nolbo_ppl.io.files import read_jsonl, write_jsonl
 from nolbo_ppl.structures.detection_checks import MAX_POSITION, check_table
 from nolbo_ppl.structures.detection_records import to_records
@@ -48,28 +49,30 @@ FIELDS = (
     "symmetry",
 )
 """Fields a line may have."""
+LARGEST = 1e9
+"""Largest number of a vector."""
+SMALLEST_SCALE, LARGEST_SCALE = 1e-12, 1e12
+"""Standard deviations whose squares, and sums of them, are numbers to calculate with."""
 WEIGHT_ROUNDING = 1e-4
 """Weights that sum to one within this are taken as they are: a file rounds them."""
 
 
 def _vector(row: dict[str, Any], key: str, length: int | None, where: dict[str, Any]) -> np.ndarray:
-    value = row[key]
-    try:
-        vector = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise input_error(f"`{key}` is not numeric", got=value, **where) from None
-    if vector.ndim != 1 or (length is not None and len(vector) != length):
-        raise input_error(f"`{key}` has the wrong shape", got=value, expected=f"a list of {length or 'd'} numbers", **where)
-    if not np.isfinite(vector).all():
-        raise input_error(f"`{key}` is not finite", got=value, **where)
+    vector = number_array(row[key], (length,), LARGEST)
+    if vector is None:
+        expected = f"a list of {length or 'd'} numbers, at most {LARGEST:g}"
+        raise input_error(f"`{key}` is no vector", got=row[key], expected=expected, **where)
     return vector
 
 
 def _scale(row: dict[str, Any], key: str, length: int, where: dict[str, Any]) -> np.ndarray:
     value = row[key]
-    vector = np.full(length, value, dtype=np.float64) if isinstance(value, (int, float)) else _vector(row, key, length, where)
-    if not (np.isfinite(vector).all() and (vector > 0).all()):
-        raise input_error(f"`{key}` is no standard deviation", got=value, expected="greater than 0", **where)
+    vector = number_array(value, (length,)) if isinstance(value, list) else None
+    if is_number(value):
+        vector = np.full(length, float(value))
+    if vector is None or not ((vector >= SMALLEST_SCALE) & (vector <= LARGEST_SCALE)).all():
+        expected = f"numbers from {SMALLEST_SCALE:g} to {LARGEST_SCALE:g}"
+        raise input_error(f"`{key}` is no standard deviation", got=value, expected=expected, **where)
     return vector
 
 
@@ -103,7 +106,7 @@ def _modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
                 f"`rotation_modes` {i} has wrong fields", got=sorted(mode), expected="weight, rotation, std", **where
             )
         w = mode["weight"]
-        if isinstance(w, bool) or not isinstance(w, (int, float)) or not np.isfinite(w) or w < 0:
+        if not is_number(w, 0, 1 + WEIGHT_ROUNDING):
             raise input_error(f"`rotation_modes` {i}: `weight` is no weight", got=w, expected="0 or more", **where)
         weight.append(float(w))
     total = sum(weight)
@@ -118,7 +121,7 @@ def _modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
 
 def _number(value: Any, low: float, high: float, what: str, where: dict[str, Any]) -> float:
     """A number in a range."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high or not np.isfinite(value):
+    if not is_number(value, low, high):
         raise input_error(what, got=value, expected=f"{low:g} to {high:g}", **where)
     return float(value)
 
@@ -175,17 +178,14 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
         if key not in row:
             raise input_error(f"`{key}` is missing", got=sorted(row), **where)
     frame = row["frame"]
-    if isinstance(frame, bool) or not isinstance(frame, int) or frame < 0:
+    if not is_whole(frame):
         raise input_error("`frame` is no row number", got=frame, expected="an integer from 0", **where)
     out: dict[str, Any] = {"frame": frame, "position": _vector(row, "position", 3, where)}
     if np.abs(out["position"]).max() > MAX_POSITION:
         raise input_error("`position` out of range", got=row["position"], expected=f"within {MAX_POSITION:g} m", **where)
     if row.get("position_cov") is not None:
-        try:
-            covariance = np.asarray(row["position_cov"], dtype=np.float64)
-        except (TypeError, ValueError):
-            covariance = np.zeros(0)
-        if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
+        covariance = number_array(row["position_cov"], (3, 3), LARGEST_SCALE**2)
+        if covariance is None:
             raise input_error("`position_cov` is no 3x3 matrix", got=row["position_cov"], **where)
         if np.abs(covariance - covariance.T).max() > 1e-6 * np.abs(covariance).max() or np.linalg.eigvalsh(covariance)[0] <= 0:
             raise input_error(
@@ -213,7 +213,7 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
         if row.get("latent_std") is not None:
             out["latent_scale"] = _scale(row, "latent_std", len(out["latent"]), where)
     objectness = row.get("objectness", 1.0)
-    if isinstance(objectness, bool) or not isinstance(objectness, (int, float)) or not 0 <= objectness <= 1:
+    if not is_number(objectness, 0, 1):
         raise input_error("`objectness` is no probability", got=objectness, expected="0 to 1", **where)
     out["objectness"] = float(objectness)
     category = row.get("category")
@@ -223,7 +223,7 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     if row.get("size") is not None:
         out["size"] = _scale(row, "size", 3, where)
     symmetry = row.get("symmetry")
-    if symmetry is not None and (isinstance(symmetry, bool) or not isinstance(symmetry, int) or symmetry < 0):
+    if symmetry is not None and not is_whole(symmetry, 0, 1000):
         raise input_error("`symmetry` is no order", got=symmetry, expected="1 none, n n-fold, 0 free", **where)
     out["symmetry"] = -1 if symmetry is None else symmetry
     out.update(_image_fields(row, where))

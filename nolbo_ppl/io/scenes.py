@@ -10,7 +10,6 @@ not labelled, and `"exhaustive"`, the categories of which every instance is labe
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,14 @@ import torch
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.rotation import quaternion_to_matrix
-from nolbo_ppl.io.files import inside
+from nolbo_ppl.io.fields import is_number
+from nolbo_ppl.io.files import inside, is_file
 from nolbo_ppl.structures.annotations import Annotations
 
+LARGEST = 1e6
+"""Largest number of a line: px, m or a share."""
+NEAREST = 1e-3
+"""Least distance of an object before the camera, m."""
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may lie from 1."""
 BORDER_TOLERANCE = 1.0
@@ -31,8 +35,8 @@ BORDER_TOLERANCE = 1.0
 
 
 def _is_number(value: object) -> bool:
-    """A finite number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """A number of a size that objects and images have; true and false are none."""
+    return is_number(value, -LARGEST, LARGEST)
 
 
 class _Line:
@@ -96,7 +100,7 @@ def _parse_object(
     position = size = None
     if "position" in known:
         position = at.numbers(row, "position", where, 3, "[x, y, z] in m")
-        if position[2] <= 0:
+        if position[2] < NEAREST:
             raise at.error(f"{where}position", position.tolist(), "a point before the camera (z > 0)")
     if "size" in known:
         size = at.number(row, "size", where, "the box diagonal in m, positive")
@@ -180,7 +184,7 @@ def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Pat
     if path is None:
         do = "link the images into the folder"
         raise input_error("image", got=name, expected="a path within the folder", do=do, file=file, line=line)
-    if not path.is_file():
+    if not is_file(path):
         raise input_error(
             "image",
             got=name,

@@ -52,7 +52,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def observed(model: Path, images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("observed") / "deep" / "out"
-    summary = run(ObserveConfig(images, out, str(model), (60.0, 60.0, 32.0, 32.0), THRESHOLD, pictures=False))
+    summary = run(ObserveConfig(images, out, str(model), (60.0, 60.0, 32.0, 32.0), threshold=THRESHOLD, pictures=False))
     assert summary.images == 4
     assert summary.detections == sum(1 for _ in read_jsonl(summary.file)) > 4
     return out

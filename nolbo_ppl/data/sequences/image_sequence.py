@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import inside
+from nolbo_ppl.io.files import inside, is_file
 from nolbo_ppl.io.images import IMAGE_SUFFIXES, image_size, list_images, open_depth_image, open_image
 from nolbo_ppl.io.text import read_words
 from nolbo_ppl.io.trajectories import match_times
@@ -163,7 +163,7 @@ def read_listing(path: Path) -> tuple[list[int], Float[np.ndarray, " n"], list[P
         file = inside(path.parent, words[1], follow=True)
         if file is None:
             raise input_error("image outside of the folder", got=words[1], do="link it into the folder", file=path, line=number)
-        if not file.is_file():
+        if not is_file(file):
             raise input_error("no such image", got=words[1], file=path, line=number)
         lines.append(number)
         times.append(stamp)

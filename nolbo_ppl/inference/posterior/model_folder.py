@@ -44,10 +44,8 @@ def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
             got=repr(str(name_or_path)),
             expected=f"one of {names}, or a folder with config.json and model.safetensors",
         )
-    file, weights = folder / "config.json", folder / "model.safetensors"
-    values = read_json(file)
-    if not isinstance(values, dict) or "model" not in values:
-        raise input_error("not a model configuration", expected='{"model": {...}, ...}', file=file)
+    weights = folder / "model.safetensors"
+    config, calibration, stated = read_model_config(folder / "config.json")
     tensors, facts = load_tensors(weights)
     form = facts.get("format", 1)
     if form not in range(1, FORMAT + 1):
@@ -55,20 +53,32 @@ def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
         raise input_error(
             "a model of another format", got=form, expected=expected, do="update nolbo_ppl to read it", file=weights
         )
-    stated = values.get("sha256")
     if stated is not None and stated != file_hash(weights):
         expected = f"SHA-256 {stated}, as config.json says"
         raise input_error("weights were changed", got=file_hash(weights), expected=expected, file=weights)
-    try:
-        config = ModelConfig.from_json(values["model"])
-        calibration = Calibration.from_json(values.get("calibration", {}))
-        with torch.device("meta"):  # shapes alone: a configuration of networks beyond any memory does not fit its weights
-            check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
-    except InputError as error:
-        raise (error if str(weights) in str(error) else located(error, file)) from None
+    with torch.device("meta"):  # shapes alone: a configuration of networks beyond any memory does not fit its weights
+        check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
     model = Nolbo.from_seed(config, seed=0)
     load_strictly(model, tensors, weights)
     return ObservationModel(model, calibration)
+
+
+def read_model_config(file: str | PathLike[str]) -> tuple[ModelConfig, Calibration, str | None]:
+    """Networks, calibration, and the SHA-256 of the weights (None where it is not stated) of a model's `config.json`.
+
+    Raises:
+        InputError: malformed, or a value of another type or out of range; names the file and the field.
+    """
+    values = read_json(file)
+    if not isinstance(values, dict) or "model" not in values:
+        raise input_error("not a model configuration", expected='{"model": {...}, ...}', file=file)
+    stated = values.get("sha256")
+    if stated is not None and not isinstance(stated, str):
+        raise input_error("sha256", got=stated, expected="64 hexadecimal digits", file=file)
+    try:
+        return ModelConfig.from_json(values["model"]), Calibration.from_json(values.get("calibration", {})), stated
+    except InputError as error:
+        raise located(error, file) from None
 
 
 def save(folder: str | PathLike[str], model: Nolbo, calibration: Calibration, meta: dict[str, Any], half: bool = False) -> None:
