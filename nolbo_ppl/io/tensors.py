@@ -79,7 +79,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
         parameter, _, key = name.rpartition("/")
         if parameter not in parameters:
             raise input_error("state of the optimiser", got=name, expected="NAME/KEY of a parameter")
-        if tensor.dim() and tensor.shape != parameters[parameter].shape:
+        if tensor.numel() not in (1, parameters[parameter].numel()):
             expected = tuple(parameters[parameter].shape)
             raise input_error(f"state {name} of the optimiser", got=tuple(tensor.shape), expected=expected)
         optimizer.state[parameters[parameter]][key] = tensor.clone()

@@ -29,7 +29,9 @@ FILES = frozenset({"metrics.jsonl", "checkpoint.safetensors", "config.json", "mo
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run: the configuration of a model is another file of the same name."""
     file = folder / "config.json"
-    return file.is_file() and {"out", "scene_steps"} <= set(read_json_object(file))
+    if not file.is_file():
+        return (folder / "checkpoint.safetensors").is_file()
+    return {"out", "scene_steps"} <= set(read_json_object(file))
 
 
 @contextmanager
@@ -114,10 +116,13 @@ class Journal:
         shapes = dict(model.named_parameters())
         for name, tensor in optimisation.part_of(tensors, "optimizer/").items():
             parameter = shapes.get(name.rpartition("/")[0])
-            if parameter is None or (tensor.dim() and tensor.shape != parameter.shape):
+            if parameter is None or tensor.numel() not in (1, parameter.numel()):  # Muon keeps matrices
                 got = f"{name} of shape {tuple(tensor.shape)}"
                 raise input_error(
-                    "state of the optimiser", got=got, expected="NAME/KEY of a parameter, in its shape", file=self.file
+                    "state of the optimiser",
+                    got=got,
+                    expected="NAME/KEY of a parameter, a number for each of its own",
+                    file=self.file,
                 )
 
     def _cut(self, number: int, at_step: int, stages: Sequence[TrainingStage]) -> None:

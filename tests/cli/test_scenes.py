@@ -49,6 +49,6 @@ def test_bad_options(tmp_path: Path) -> None:
         run(ScenesConfig(tmp_path / "a", size=33))
     with pytest.raises(InputError, match="number of scenes: got 0"):
         run(ScenesConfig(tmp_path / "b", count=0))
-    with pytest.raises(InputError, match="no such folder of pictures"):
+    with pytest.raises(InputError, match="no such folder of images"):
         run(ScenesConfig(tmp_path / "c", backgrounds=tmp_path / "absent"))
     assert not (tmp_path / "c" / "images").exists()
