@@ -7,6 +7,7 @@ latents. `resolve` settles all of it; tracking, association, the graph and the m
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -50,13 +51,13 @@ class Measurements:
 
     def select(self, rows: np.ndarray) -> Measurements:
         """Some of the rows."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         return Measurements(**{k: v.select(rows) if isinstance(v, OrientationModes) else v[rows] for k, v in values.items()})
 
     def in_world(self, T_world_camera: Float[np.ndarray, "n 4 4"]) -> Measurements:
         """Positions, covariances and orientations carried to the world by one pose a detection."""
         R = T_world_camera[:, :3, :3]
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {
             "position": transform(T_world_camera, self.position),
             "covariance": R @ self.covariance @ np.swapaxes(R, 1, 2),

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.pose import inverse, is_rotation, se3_exp, transform
 from nolbo_ppl.inference.slam.class_posterior import ConfusionModel, class_posterior, count_votes, fit_confusion
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE
@@ -93,6 +94,37 @@ class SlamResult:
     def landmark_covariances(self) -> Float[np.ndarray, "m 6 6"]:
         """Covariances of all landmarks, [rotation rad, position m] in the object's own frame."""
         return self.linearisation.covariance(np.arange(self.linearisation.landmarks))
+
+    def sample(self, count: int, seed: int) -> tuple[Float[np.ndarray, "s n 4 4"], Float[np.ndarray, "s m 4 4"]]:
+        """Joint samples of all poses and landmarks, T_world_camera and T_world_object (Laplace, given the associations).
+
+        Example: `poses, landmarks = result.sample(100, seed=0)`, then
+        `np.linalg.norm(poses[:, -1, :3, 3] - landmarks[:, 0, :3, 3], axis=1)` is the posterior of a distance, in m.
+
+        Args:
+            count: number of samples.
+            seed: of the generator.
+        """
+        poses, landmarks = self.linearisation.samples(count, np.random.default_rng(seed))
+        return (
+            self.T_world_camera @ se3_exp(np.moveaxis(poses, 2, 0)),
+            self.state.estimate.T_world_landmark @ se3_exp(np.moveaxis(landmarks, 2, 0)),
+        )
+
+    def expected_detections(self, T_world_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " m"]:
+        """Posterior probability that each landmark is detected from a pose: existence times detection probability there.
+
+        Example: `result.expected_detections(result.T_world_camera[-1]).sum()` is the expected number of detections of mapped
+        objects in the last frame, occlusion as it is on average.
+
+        Raises:
+            InputError: no pose.
+        """
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        if T.shape != (4, 4) or not np.isfinite(T).all() or not is_rotation(T[:3, :3]):
+            raise input_error("T_world_camera is no pose", got=T, expected="a finite 4 x 4 rigid motion")
+        local = transform(inverse(T), self.state.estimate.T_world_landmark[:, :3, 3])
+        return self.existence() * self.associations.model.probability(local)
 
     @cached_property
     def landmarks(self) -> tuple[Landmark, ...]:

@@ -231,6 +231,31 @@ def state_values(state: object) -> gtsam.Values:
     return to_values(state.estimate)  # type: ignore[attr-defined]
 
 
+def test_samples_are_of_the_posterior(worlds: list[tuple[SimulatedSequence, SlamResult]]) -> None:
+    """Positions of poses and landmarks spread as the marginal covariances say, and vary together."""
+    _, result = worlds[0]
+    poses, landmarks = result.sample(2000, seed=1)
+    R = result.T_world_camera[40, :3, :3]
+    exact = R @ result.pose_covariances(np.array([40]))[0, 3:, 3:] @ R.T
+    if len(result.hypotheses) < 2:  # else the covariance is that of the mixture
+        drawn = np.cov(poses[:, 40, :3, 3].T)
+        error = np.sqrt((np.outer(np.diag(exact), np.diag(exact)) + exact**2) / 2000)
+        assert (np.abs(drawn - exact) < 5 * error + 0.02 * np.abs(exact).max()).all()
+    assert landmarks.shape == (2000, len(result.landmarks), 4, 4)
+    found = result.associations
+    j = int(found.landmark[np.argmax(found.row)])  # seen in the last frames, far from the first pose
+    apart = poses[:, -1, :3, 3] - landmarks[:, j, :3, 3]
+    assert np.trace(np.cov(apart.T)) < np.trace(np.cov(poses[:, -1, :3, 3].T)) + np.trace(np.cov(landmarks[:, j, :3, 3].T))
+
+
+def test_expected_detections_are_as_many_as_there_were(worlds: list[tuple[SimulatedSequence, SlamResult]]) -> None:
+    for _, result in worlds:
+        expected = sum(result.expected_detections(T).sum() for T in result.T_world_camera)
+        assert abs(expected - result.associations.weight.sum()) < 0.15 * result.associations.weight.sum()
+    with pytest.raises(InputError, match="no pose"):
+        worlds[0][1].expected_detections(np.full((4, 4), np.nan))
+
+
 def test_the_graph_is_gtsams_own(worlds: list[tuple[SimulatedSequence, SlamResult]]) -> None:
     """A user adds a factor, here a known position of the last pose, and solves again."""
     drive, result = worlds[0]
