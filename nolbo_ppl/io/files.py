@@ -159,7 +159,8 @@ def _decoded(data: bytes, path: Path, first: int = 1) -> str:
         return data.decode("utf-8-sig" if first == 1 else "utf-8")
     except UnicodeDecodeError as error:
         line = first + data.count(b"\n", 0, error.start)
-        got = f"byte {data[error.start]:#04x}"
+        wide = first == 1 and data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        got = "UTF-16" if wide else f"byte {data[error.start]:#04x}"
         raise input_error("not a text file", got=got, expected="UTF-8", do="save it as UTF-8", file=path, line=line) from None
 
 

@@ -209,6 +209,12 @@ def test_a_byte_order_mark_is_nothing(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_trajectory(tmp_path / "t.txt").T_world_camera[0], np.eye(4))
 
 
+def test_utf_16_is_named(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text(f"{IDENTITY}\n", encoding="utf-16")
+    with pytest.raises(InputError, match=r"t\.txt:1: not a text file: got UTF-16, expected UTF-8; save it as UTF-8"):
+        read_trajectory(tmp_path / "t.txt")
+
+
 def test_decimal_commas_are_named(tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text("0,5 0 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match=r"t\.txt:1: decimal commas: got .*, expected decimal points"):
