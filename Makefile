@@ -9,7 +9,7 @@ TEST_WORKERS ?= 2
 # Time of `make fuzz`; hours find more.
 FUZZ_SECONDS ?= 600
 
-.PHONY: setup demo train test lint wheel bench bench-gate docs clean fuzz
+.PHONY: setup demo train test test-shapes lint wheel bench bench-gate docs clean fuzz
 
 setup: $(STAMP)
 
@@ -26,6 +26,10 @@ train: $(STAMP)
 
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_WORKERS)
+
+# The shapes and dtypes of annotations, checked at every call. The rooms named here are right; a next one is added when it is.
+test-shapes: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --jaxtyping-packages=nolbo_ppl.geometry,beartype.beartype tests/geometry
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -15,7 +15,7 @@ def box_area(box: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
     return (box[..., 2] - box[..., 0]).clamp_min(0) * (box[..., 3] - box[..., 1]).clamp_min(0)
 
 
-def box_iou(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
+def box_iou(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch"]:
     """Intersection over union of paired boxes (broadcast); two boxes without area have 0."""
     corner_min = torch.maximum(a[..., :2], b[..., :2])
     corner_max = torch.minimum(a[..., 2:], b[..., 2:])

@@ -159,7 +159,7 @@ def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, ...]:
     return np.linalg.norm(so3_log(R), axis=-1)
 
 
-def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, n] | None = None) -> np.ndarray:
+def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None) -> np.ndarray:
     """Chordal mean of rotations."""
     return nearest_rotation(np.average(R, axis=0, weights=weights))
 

@@ -31,7 +31,7 @@ def _axis_rotation(axis: int, cosine: Tensor, sine: Tensor) -> Tensor:
 
 
 def viewpoint_moments_to_matrix(
-    cosine: Float[Tensor, "*batch 3"], sine: Float[Tensor, "*batch 3"]
+    cosine: Float[Tensor, "*#batch 3"], sine: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
     """Rotation from the cosines and sines of (azimuth, elevation, in-plane).
 
@@ -72,7 +72,7 @@ def matrix_to_viewpoint(R_camera_object: Float[Tensor, "*batch 3 3"]) -> Float[T
     return torch.stack((wrap_angle(azimuth), elevation, wrap_angle(in_plane)), dim=-1)
 
 
-def geodesic_angle(R1: Float[Tensor, "*batch 3 3"], R2: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+def geodesic_angle(R1: Float[Tensor, "*#batch 3 3"], R2: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Angle in radians between two rotations, `||log(R1' R2)||_F / sqrt 2`, accurate at both ends of [0, pi]."""
     chord = torch.linalg.matrix_norm(R1 - R2) / (2 * math.sqrt(2.0))  # = sin(angle / 2)
     cosine_half = torch.sqrt(((R1 * R2).sum((-2, -1)) + 1).clamp_min(0.0)) / 2
@@ -143,14 +143,14 @@ def ray_rotation(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def allocentric_to_egocentric(
-    R_allocentric: Float[Tensor, "*batch 3 3"], ray: Float[Tensor, "*batch 3"]
+    R_allocentric: Float[Tensor, "*#batch 3 3"], ray: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
     """R_camera_object from the orientation relative to the ray through the object's centre (docs/story.md, conventions)."""
     return ray_rotation(ray) @ R_allocentric
 
 
 def egocentric_to_allocentric(
-    R_camera_object: Float[Tensor, "*batch 3 3"], ray: Float[Tensor, "*batch 3"]
+    R_camera_object: Float[Tensor, "*#batch 3 3"], ray: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
     """Orientation relative to the viewing ray, what the image of the object shows, from R_camera_object."""
     return ray_rotation(ray).mT @ R_camera_object

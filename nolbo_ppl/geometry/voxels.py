@@ -19,7 +19,7 @@ def voxel_centres(n: int) -> Float[np.ndarray, " {n}"]:
     return (np.arange(n) + 0.5) / n - 0.5
 
 
-def pack_voxels(voxels: Bool[np.ndarray, "*batch n n n"]) -> UInt8[np.ndarray, "*batch bytes"]:
+def pack_voxels(voxels: Bool[np.ndarray, "*batch _ _ _"]) -> UInt8[np.ndarray, "*batch bytes"]:
     """Pack grids to bits (C order, most significant bit first, zeros filled up to a byte): `numpy.packbits`.
 
     Raises:
@@ -46,7 +46,7 @@ def unpack_voxels(packed: UInt8[np.ndarray, "*batch bytes"], n: int) -> Bool[np.
     return np.unpackbits(packed, axis=-1, count=n**3).astype(bool).reshape(*packed.shape[:-1], n, n, n)
 
 
-def voxel_iou(a: Bool[np.ndarray, "*batch n n n"], b: Bool[np.ndarray, "*batch n n n"]) -> Float[np.ndarray, "*batch"]:
+def voxel_iou(a: Bool[np.ndarray, "*#batch _ _ _"], b: Bool[np.ndarray, "*#batch _ _ _"]) -> Float[np.ndarray, "*batch"]:
     """Intersection over union of paired grids (broadcast); two empty grids agree: 1.
 
     Raises:
@@ -60,7 +60,7 @@ def voxel_iou(a: Bool[np.ndarray, "*batch n n n"], b: Bool[np.ndarray, "*batch n
 
 
 def voxels_to_mesh(
-    occupancy: Float[np.ndarray, "n n n"] | Bool[np.ndarray, "n n n"], level: float = 0.5
+    occupancy: Float[np.ndarray, "_ _ _"] | Bool[np.ndarray, "_ _ _"], level: float = 0.5
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Surface at `level` of an occupancy grid by marching cubes, in canonical coordinates.
 

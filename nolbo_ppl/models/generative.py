@@ -22,6 +22,7 @@ import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
 from pyro import poutine
+from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor, nn
 from torch.distributions import kl_divergence
 
@@ -46,7 +47,7 @@ from nolbo_ppl.models.scene_batch import SceneBatch, unpack_bits
 from nolbo_ppl.models.shape_networks import VoxelDecoder
 
 
-def conjugate_truth(observed: Float[Tensor, "*n d"], scale: float) -> dist.TorchDistribution:
+def conjugate_truth(observed: Float[Tensor, "*n d"], scale: float) -> TorchDistributionMixin:
     """p(z | y) of z ~ N(0, 1), y ~ N(z, scale^2): N(y / (1 + scale^2), scale^2 / (1 + scale^2)), per dimension."""
     shrink = 1 / (1 + scale**2)
     return dist.Normal(observed * shrink, torch.full_like(observed, scale * math.sqrt(shrink))).to_event(1)

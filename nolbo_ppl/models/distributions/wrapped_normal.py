@@ -66,8 +66,8 @@ class WrappedNormal(TorchDistribution):
 
     def __init__(
         self,
-        loc: Float[Tensor, "*batch"] | float,
-        scale: Float[Tensor, "*batch"] | float,
+        loc: Float[Tensor, "*#batch"] | float,
+        scale: Float[Tensor, "*#batch"] | float,
         validate_args: bool | None = None,
     ) -> None:
         self.loc, self.scale = broadcast_all(loc, scale)
