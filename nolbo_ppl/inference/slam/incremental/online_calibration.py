@@ -8,7 +8,7 @@ import numpy as np
 
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, fit_prior
 from nolbo_ppl.inference.slam.initialise import init
-from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
+from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_TRANSLATION_RATIO, estimate_noise
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 
 DEFAULT_RATE = 1e-3
@@ -51,8 +51,11 @@ def calibrate_online(reference: SlamProblem, config: SlamConfig) -> OnlineCalibr
         rotation = float(np.median(noise.rotation_step))
         if ratio is None and constant is None:
             step = float(np.median(noise.translation_step))
-            length = np.linalg.norm(np.diff(reference.odometry[:, :3, 3], axis=0), axis=1)
-            ratio, constant = step / max(float(np.median(length)), 1e-9), 0.2 * step
+            length = float(np.median(np.linalg.norm(np.diff(reference.odometry[:, :3, 3], axis=0), axis=1)))
+            # A reference that stands still says nothing of how the error grows with the step.
+            moving = length > step
+            ratio = step / length if moving else DEFAULT_TRANSLATION_RATIO
+            constant = 0.2 * step if moving else step
     lateral, radial = report.get("position_lateral"), report.get("position_radial")
     position, growth = config.position_scale, config.position_ratio
     if position is None and growth is None and lateral is not None and radial is not None:

@@ -7,7 +7,7 @@ import pytest
 
 from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.slam import IncrementalSlam, OnlineInfo, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam import IncrementalSlam, OnlineInfo, SlamConfig, SlamProblem, solve_online
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.structures.detections import Detections, make_table
@@ -150,3 +150,12 @@ def test_covariances_for_all_steps_or_for_none() -> None:
     slam.update(np.eye(4), empty_table(), 1e-4 * np.eye(6))
     with pytest.raises(InputError, match="some keyframes only"):
         slam.update(np.eye(4), empty_table())
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_drive_of_one_or_two_frames_has_an_answer_without_nan(frames: int) -> None:
+    table = make_table(np.zeros(2, int), np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 8.0]]))
+    result = solve_online(SlamProblem(np.tile(np.eye(4), (frames, 1, 1)), table))
+    assert np.isfinite(result.T_world_camera).all()
+    scales = [v for v in vars(result.state.config).values() if isinstance(v, float)]
+    assert np.isfinite(scales).all()
