@@ -52,7 +52,8 @@ class Measurements:
     def select(self, rows: np.ndarray) -> Measurements:
         """Some of the rows."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Measurements(**{k: v.select(rows) if isinstance(v, OrientationModes) else v[rows] for k, v in values.items()})
+        taken: dict[str, Any] = {k: v.select(rows) if k == "modes" else v[rows] for k, v in values.items()}
+        return Measurements(**taken)
 
     def in_world(self, T_world_camera: Float[np.ndarray, "n 4 4"]) -> Measurements:
         """Positions, covariances and orientations carried to the world by one pose a detection."""
