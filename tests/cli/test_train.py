@@ -479,7 +479,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_term(
         ({"batch": 0}, "batch: got 0, expected at least 1"),
         ({"freeze": 1.5}, "freeze: got 1.5"),
         ({"sizes": (100,)}, "sizes: got \\(100,\\), expected positive multiples of 32"),
-        ({"scenes": None, "validation": None, "instance_labels": True}, "give --scenes"),
+        ({"scenes": None, "validation": None, "instance_labels": True}, "give one folder of --scenes"),
         ({"scenes": None}, "held-out scenes without training scenes"),
         ({"symmetry": (2, 1)}, "symmetry: got 2 for 0 categories, expected one for each of --categories"),
         ({"categories": ("box", "mug"), "symmetry": (2,)}, "symmetry: got 1 for 2 categories"),

@@ -16,7 +16,7 @@ from tests.factories import tiny_model
 
 def landmark(index: int, latent: np.ndarray | None, scale: float = 0.5) -> Landmark:
     variance = None if latent is None else np.full(len(latent), scale**2)
-    return Landmark(index, np.eye(4), np.eye(6), np.eye(3), False, 1.0, {}, latent, variance, None, 3.0, 0, 2)
+    return Landmark(f"L{index}", np.eye(4), np.eye(6), np.eye(3), False, 1.0, {}, latent, variance, None, 3.0, 0, 2)
 
 
 @pytest.fixture(scope="module")

@@ -276,10 +276,10 @@ def test_photographs_lie_behind_the_objects(tmp_path) -> None:
     with_picture = SceneSource(config, seed=0, instances=1, backgrounds=str(tmp_path))
     assert with_picture.scene(0).view.backdrop.picture is not None
     assert not np.array_equal(with_picture.render(0).image, SceneSource(config, seed=0, instances=1).render(0).image)
-    with pytest.raises(InputError, match="no picture in the folder"):
+    with pytest.raises(InputError, match="no image in the folder"):
         (tmp_path / "empty").mkdir()
         SceneSource(config, backgrounds=str(tmp_path / "empty")).scene(0)
-    with pytest.raises(InputError, match="no such folder of pictures"):
+    with pytest.raises(InputError, match="no such folder of images"):
         SceneSource(config, backgrounds=str(tmp_path / "absent")).scene(0)
     (tmp_path / "empty" / "broken.jpg").write_bytes(b"not a picture")
     with pytest.raises(InputError, match=r"broken.jpg: not a readable image"):
