@@ -177,10 +177,13 @@ def test_a_signal_cleans_up(
             signal.raise_signal(number)
 
     monkeypatch.setattr("nolbo_ppl.cli.report.main", work)
-    before = signal.getsignal(number)
-    with pytest.raises(SystemExit) as caught:
-        main(["report"])
+    inherited = signal.signal(number, signal.SIG_DFL)  # under nohup SIGHUP is ignored, and stays so
+    try:
+        with pytest.raises(SystemExit) as caught:
+            main(["report"])
+        assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        signal.signal(number, inherited)
     assert caught.value.code == status
     assert f"stopped by signal {number.name}" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    assert signal.getsignal(number) == before
