@@ -15,6 +15,7 @@ from scipy.special import betaln, expit, logsumexp
 
 from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.measurements import Measurements
+from nolbo_ppl.inference.slam.noise.noise_estimation import widening
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
 CENTRES = 500
@@ -177,7 +178,7 @@ def initial_frame_model(measurements: Measurements, config: SlamConfig, frames: 
     floor = seen.covariance.mean(axis=0) if n else np.eye(3)
     value, axes = np.linalg.eigh(covariance)
     value = np.maximum(value, np.einsum("ia,ij,ja->a", axes, floor, axes))
-    spread = axes * np.sqrt(value)
+    spread = axes * np.sqrt(value) * widening(seen.position)
     distance = np.linalg.norm(seen.position, axis=1) if n else np.array([1.0])
     edges = np.quantile(distance, np.linspace(0, 1, RANGES + 1))
     edges = np.maximum.accumulate(edges + 1e-9 * np.arange(RANGES + 1) * max(edges[-1], 1.0))

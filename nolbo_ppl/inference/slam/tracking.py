@@ -217,6 +217,9 @@ def summarise_tracks(
     np.minimum.at(first, assigned[used], table.frame[used])
     np.maximum.at(last, assigned[used], table.frame[used])
     moving = moving_tracks(problem, noise, config, assigned, m)
+    if moving.all() and problem.odometry_covariance is None and config.odometry_rotation_scale is None:
+        # Everything moves against an odometry of guessed scales: it is the odometry that moves.
+        moving = np.zeros(m, dtype=bool)
     return Tracklets(assigned, np.where(used, weight, 0.0), first, last, count[keep] if total else np.zeros(0, int), moving)
 
 
