@@ -5,6 +5,8 @@ The names below are the public interface: they stay, and change with a warning. 
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -131,3 +133,15 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """The public names."""
     return list(__all__)
+
+
+class _Package(ModuleType):
+    """The package: a module that is imported by a path of 0.1.0 (`nolbo_ppl.evaluate`) does not hide the public name."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Bind a name, as importing a submodule does, unless a public function or class has it."""
+        if not (isinstance(value, ModuleType) and PUBLIC.get(name, ":").partition(":")[2]):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

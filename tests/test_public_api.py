@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import doctest
+import importlib
 import inspect
 import subprocess
 import sys
@@ -82,3 +83,12 @@ def test_what_is_light_stays_light(program: str, seconds: float) -> None:
         return min(float(subprocess.run([sys.executable, "-c", timed], capture_output=True, text=True).stderr) for _ in range(3))
 
     assert spent(f"try:\n    {program}\nexcept SystemExit: pass") - spent("") < seconds
+
+
+@pytest.mark.parametrize("name", ["evaluate", "run"])
+def test_an_import_path_of_the_first_version_does_not_hide_the_public_name(name: str) -> None:
+    sys.modules.pop(f"nolbo_ppl.{name}", None)
+    with pytest.warns(FutureWarning, match=f"nolbo_ppl.{name} moved"):
+        old = importlib.import_module(f"nolbo_ppl.{name}")
+    assert old.main is importlib.import_module(f"nolbo_ppl.cli.{name}").main
+    assert callable(getattr(nolbo_ppl, name))
