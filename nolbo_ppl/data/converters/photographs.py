@@ -101,7 +101,7 @@ def _thing(row: dict[str, Any], label: dict[Any, int], file: Path) -> tuple[list
     angles = [float("nan")] * 3
     if row.get("azimuth") is not None:
         angles = [float(np.radians(row.get(name) or 0.0)) for name in ("azimuth", "elevation", "theta")]
-        angles[2] = -angles[2]  # PASCAL3D+ turns the picture with y upwards
+        angles[2] = -angles[2]  # these poses turn the picture clockwise, PASCAL3D+ the other way (seen on tilted cars)
         angles[0] = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
     return [x, y, x + width, y + height], label[row["category_id"]], bool(row.get("difficult") or row.get("iscrowd")), angles
 
