@@ -21,13 +21,9 @@ from nolbo_ppl.inference.slam.graph import (
     Linearisation,
     Links,
     SlamEstimate,
-    add_landmark_priors,
     add_links,
-    add_observation_factors,
     linearise,
-    odometry_factors,
     optimise,
-    resolve_observations,
 )
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
@@ -37,7 +33,7 @@ from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, 
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
 from nolbo_ppl.inference.slam.orientation import OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
-from nolbo_ppl.inference.slam.slam_state import SlamState
+from nolbo_ppl.inference.slam.slam_state import SlamState, measured_graph
 from nolbo_ppl.inference.slam.tracking import Tracklets, build_tracklets
 
 RETRACK = 2.5
@@ -78,20 +74,7 @@ def first_estimate(
 
 def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     """Odometry, weighted observations and weak priors; the M-step adds its links."""
-    factors = resolve_observations(
-        state.measurements,
-        state.problem.odometry,
-        state.noise,
-        state.config,
-        state.estimate,
-        state.rows,
-        state.landmark,
-        state.weight,
-    )
-    graph = odometry_factors(state.problem, state.noise)
-    add_observation_factors(graph, factors)
-    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
-    return graph
+    return measured_graph(state)[0]
 
 
 def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:

@@ -5,12 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
 from nolbo_ppl.inference.slam.frame_model import FrameModel
-from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
+from nolbo_ppl.inference.slam.graph import (
+    Links,
+    ObservationFactors,
+    SlamEstimate,
+    add_landmark_priors,
+    add_observation_factors,
+    odometry_factors,
+    resolve_observations,
+)
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
@@ -83,3 +92,21 @@ def link_scale(noise: NoiseModel) -> float:
     if not len(noise.position_covariance):
         return 0.1
     return 0.5 * float(np.sqrt(np.median(np.trace(noise.position_covariance, axis1=1, axis2=2)) / 3))
+
+
+def measured_graph(state: SlamState) -> tuple[gtsam.NonlinearFactorGraph, ObservationFactors]:
+    """Odometry, weighted observations and weak priors of a state, in this order, and the observations' factors."""
+    factors = resolve_observations(
+        state.measurements,
+        state.problem.odometry,
+        state.noise,
+        state.config,
+        state.estimate,
+        state.rows,
+        state.landmark,
+        state.weight,
+    )
+    graph = odometry_factors(state.problem, state.noise)
+    add_observation_factors(graph, factors)
+    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
+    return graph, factors

@@ -17,14 +17,10 @@ from jaxtyping import Float, Int
 from nolbo_ppl.inference.slam.graph import (
     LOOSE_ROTATION,
     ObservationFactors,
-    add_landmark_priors,
     add_links,
-    add_observation_factors,
     linearise,
-    odometry_factors,
-    resolve_observations,
 )
-from nolbo_ppl.inference.slam.slam_state import SlamState
+from nolbo_ppl.inference.slam.slam_state import SlamState, measured_graph
 
 SAMPLES = 48
 """Samples of the residuals that the model expects."""
@@ -53,19 +49,7 @@ class FittedResiduals:
 
 def whole_graph(state: SlamState) -> tuple[gtsam.NonlinearFactorGraph, ObservationFactors]:
     """Odometry, detections, priors and links of a state, in this order, and the detections' factors."""
-    factors = resolve_observations(
-        state.measurements,
-        state.problem.odometry,
-        state.noise,
-        state.config,
-        state.estimate,
-        state.rows,
-        state.landmark,
-        state.weight,
-    )
-    graph = odometry_factors(state.problem, state.noise)
-    add_observation_factors(graph, factors)
-    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
+    graph, factors = measured_graph(state)
     add_links(graph, state.links, state.config.robust_width)
     return graph, factors
 
