@@ -110,7 +110,7 @@ def scene_line(image: ArchiveImage, name: str, benchmark: bool = False) -> dict[
         if thing.instance is not None:
             row["instance"] = thing.instance
         if thing.viewpoint is not None:
-            R = torch.from_numpy(pascal_rotation(thing.viewpoint, thing.box, camera))
+            R = torch.from_numpy(pascal_rotation(thing.viewpoint, box.tolist(), camera))  # the ray a reader takes
             row["rotation"] = [round(v, 9) for v in matrix_to_quaternion(R).tolist()]
         objects.append(row)
     line: dict[str, Any] = {"image": name, "intrinsics": camera, "objects": objects, "ignore": ignore}

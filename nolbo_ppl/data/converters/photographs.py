@@ -7,21 +7,19 @@ it is missing), and an annotation `difficult` and a viewpoint `azimuth`, `elevat
 from __future__ import annotations
 
 import os
-import shutil
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.data.converters.archives import ArchiveImage, ArchiveObject, write_archive
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, matrix_to_quaternion, viewpoint_to_matrix
-from nolbo_ppl.io.files import read_json, write_json, write_jsonl
+from nolbo_ppl.io.files import read_json
 
 
 @dataclass(frozen=True)
@@ -114,43 +112,23 @@ def convert_photographs(
     Cameras are unknown: intrinsics are those of a camera that sees 60 degrees across, which nothing is learnt from, since
     no position is known. Crowds and difficult objects become regions to ignore.
     """
-    out = Path(out)
-    (out / "images").mkdir(parents=True, exist_ok=True)
-    rows, objects, oriented = [], 0, 0
-    for number, photo in enumerate(photographs):
-        name = f"images/{number:06d}{photo.image.suffix}"
-        shutil.copyfile(photo.image, out / name)
-        focal = photo.width / (2 * np.tan(np.radians(30)))
-        camera = np.array([focal, focal, photo.width / 2, photo.height / 2])
-        limit = np.array([photo.width, photo.height] * 2)
-        boxes = np.clip(photo.box, 0, limit)
-        usable = (boxes[:, 2:] - boxes[:, :2] >= 2).all(1)
-        things = []
-        for k in np.flatnonzero(usable & ~photo.ignore):
-            thing: dict[str, Any] = {"box": boxes[k].tolist(), "category": categories[photo.category[k]]}
-            if np.isfinite(photo.viewpoint[k]).all():
-                thing["rotation"] = _rotation(photo.viewpoint[k], boxes[k], camera)
-                oriented += 1
-            things.append(thing)
-        objects += len(things)
-        rows.append(
-            {
-                "image": name, "intrinsics": camera.tolist(), "objects": things,
-                "ignore": boxes[usable & photo.ignore].tolist(),
-                "exhaustive": [categories[label] for label in sorted(photo.exhaustive)],
-            }
-        )  # fmt: skip
-    sources: dict[str, int] = defaultdict(int)
-    for photo in photographs:
-        sources[f"{photo.source}: {photo.licence}"] += 1
-    write_json(out / "source.json", {"photographs": len(rows), "sources": dict(sources)})
-    write_jsonl(out / "scenes.jsonl", rows)
-    return {"images": len(rows), "objects": objects, "viewpoints": oriented}
-
-
-def _rotation(viewpoint: Float[np.ndarray, " 3"], box: Float[np.ndarray, " 4"], camera: Float[np.ndarray, " 4"]) -> list[float]:
-    """Egocentric rotation (quaternion) of an allocentric viewpoint seen through the middle of a box."""
-    slope = ((box[:2] + box[2:]) / 2 - camera[2:]) / camera[:2]
-    ray = torch.tensor([[*slope.tolist(), 1.0]], dtype=torch.float64)
-    R = allocentric_to_egocentric(viewpoint_to_matrix(torch.from_numpy(viewpoint[None])), ray)
-    return [round(v, 9) for v in matrix_to_quaternion(R)[0].tolist()]
+    sources = Counter(f"{photo.source}: {photo.licence}" for photo in photographs)
+    images = [
+        ArchiveImage(
+            photo.image,
+            (photo.width, photo.height),
+            tuple(
+                ArchiveObject(
+                    categories[label],
+                    tuple(box),
+                    tuple(viewpoint) if np.isfinite(viewpoint).all() else None,
+                    difficult=bool(ignored),
+                )
+                for label, box, viewpoint, ignored in zip(photo.category, photo.box.tolist(), photo.viewpoint, photo.ignore)
+            ),
+            tuple(categories[label] for label in sorted(photo.exhaustive)),
+        )
+        for photo in photographs
+    ]
+    counts = write_archive(out, images, {"photographs": len(images), "sources": dict(sources)})
+    return {name: counts[name] for name in ("images", "objects", "viewpoints")}

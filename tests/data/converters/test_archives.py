@@ -73,6 +73,16 @@ def test_the_viewpoint_is_that_of_the_ray_through_the_box() -> None:
     assert "position" not in line["objects"][0]
 
 
+def test_a_box_that_sticks_out_is_seen_through_its_middle_inside_the_image() -> None:
+    box = (-40.0, 10.0, 30.0, 50.0)
+    line = scene_line(ArchiveImage(Path("x.jpg"), (100, 80), (ArchiveObject("car", box, (0.7, 0.1, -0.2)),)), "images/0.jpg")
+    fx, fy, cx, cy = line["intrinsics"]
+    assert line["objects"][0]["box"] == [0.0, 10.0, 30.0, 50.0]
+    R = quaternion_to_matrix(torch.tensor(line["objects"][0]["rotation"], dtype=torch.float64))
+    ray = torch.tensor([(15.0 - cx) / fx, (30.0 - cy) / fy, 1.0], dtype=torch.float64)
+    np.testing.assert_allclose(matrix_to_viewpoint(egocentric_to_allocentric(R, ray)), [0.7, 0.1, -0.2], atol=1e-8)
+
+
 def make_pascal(root: Path) -> None:
     objects = [
         {
