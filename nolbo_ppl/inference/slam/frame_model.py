@@ -15,7 +15,7 @@ from scipy.special import betaln, expit, logsumexp
 
 from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.measurements import Measurements
-from nolbo_ppl.inference.slam.noise.noise_estimation import widening
+from nolbo_ppl.inference.slam.noise.view_volume import widening
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
 CENTRES = 500

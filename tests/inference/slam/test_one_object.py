@@ -5,7 +5,6 @@ import pytest
 
 from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, transform
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve, solve_online
-from nolbo_ppl.inference.slam.noise.noise_estimation import LEAST_REACH, widening
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.structures.detections import Detections
 
@@ -35,12 +34,3 @@ def test_one_object_is_one_landmark_and_corrects_the_odometry(seed: int, stated:
         assert result.landmarks[0].detections > 0.6 * len(problem.observations)
         assert result.landmarks[0].existence > 0.99
         assert absolute_trajectory_error(result.T_world_camera, truth).rmse < 0.8 * before
-
-
-def test_where_detections_come_from_is_no_narrower_than_a_part_of_their_range() -> None:
-    rng = np.random.default_rng(0)
-    near = np.array([0.0, 0.0, 8.0]) + rng.normal(0, 0.1, (500, 3))
-    largest = np.sqrt(np.linalg.eigvalsh(np.cov(near.T))[-1])
-    assert widening(near) * largest == pytest.approx(LEAST_REACH * np.linalg.norm(near, axis=1).mean())
-    assert widening(rng.uniform(-10, 10, (500, 3))) == 1.0  # seen all around: nothing to widen
-    assert widening(near[:1]) == 1.0

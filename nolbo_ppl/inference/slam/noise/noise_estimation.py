@@ -10,6 +10,7 @@ from scipy.special import gammainc, gammaln
 
 from nolbo_ppl.geometry.pose import relative, so3_log, transform
 from nolbo_ppl.inference.slam.gaussian import squared_distance
+from nolbo_ppl.inference.slam.noise.view_volume import view_volume
 from nolbo_ppl.inference.slam.orientation import nearest_of_modes, observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.io.observations import Detections
@@ -27,11 +28,6 @@ TOO_SMALL = 1.35
 """A stated scale is called too small when normalised residuals are this wide."""
 SURE_GAIN = 8.0
 """And when this width is more probable than the stated one by as many nats."""
-FLAT_WORLD = 0.1
-"""Least thickness of the observed space, as a part of its extent: a density per m^3 of a plane is no rate."""
-LEAST_REACH = 0.25
-"""Least standard deviation of where detections come from, as a part of their range: a camera that circles one object sees it at
-one and the same place, which says nothing of false detections falling just there."""
 LEAST_PAIRS = 5
 """Fewer pairs of one object than this tell no scale."""
 NEAREST = 6
@@ -314,23 +310,6 @@ def odometry_scales(
     constant, ratio = constant or 0.0, ratio or 0.0
     translation = np.sqrt(constant**2 + (ratio * length) ** 2)
     return np.full(len(length), max(rotation, 1e-6)), np.maximum(translation, 1e-4 * typical)
-
-
-def view_volume(table: Detections) -> float:
-    """Volume detections come from, m^3: that of the ellipsoid uniform points of this covariance would fill."""
-    if len(table) < 5:
-        return 1000.0
-    extent = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(table.position.T)), 0.0))
-    extent = np.maximum(extent, max(FLAT_WORLD * float(extent[-1]), 1e-3))
-    return float(4.0 / 3.0 * np.pi * 5.0**1.5 * np.prod(extent)) * widening(table.position) ** 3
-
-
-def widening(position: Float[np.ndarray, "n 3"]) -> float:
-    """Factor, 1 or more, that brings the largest spread of positions in the camera frame to `LEAST_REACH` of their range."""
-    if len(position) < 2:
-        return 1.0
-    largest = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(position.T))[-1], 0.0)))
-    return max(1.0, LEAST_REACH * float(np.linalg.norm(position, axis=1).mean()) / max(largest, 1e-3))
 
 
 def _ray_parts(position: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
