@@ -80,17 +80,18 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
     moving = moving_detections(state)
     log_odds, weight = np.full(m, 50.0), np.zeros(len(pairs))  # every landmark exists until the first E-step
     hit_cell = model.cell(pairs.local)
+    log_density = model.log_detection_density(seen.position)
     for _ in range(ROUNDS):
         score = model.log_score_ratio(seen)
-        log_clutter = model.log_clutter(seen)
+        log_clutter = model.log_clutter(seen, log_density)
         count, chance = of_detection.totals(model, n)
         chance = np.clip(chance, *PROBABILITY_LIMITS)
         log_once = model.log_pattern(np.ones(n), np.maximum(count, 1.0), chance) - np.log(chance)
         log_once[moving] = 0.0  # it was elsewhere
         log_new = score + log_once + np.log(model.unmapped)
-        log_new += np.log(model.new_rate) if model.new_rate is not None else model.log_objects(seen)
+        log_new += np.log(model.new_rate) if model.new_rate is not None else model.log_objects(seen, log_density)
         log_null = np.logaddexp(log_new, log_clutter)
-        log_odds_without = log_odds[pairs.landmark] - contribution(state, pairs, weight, model, of_landmark)
+        log_odds_without = log_odds[pairs.landmark] - contribution(state, pairs, weight, model, of_landmark, log_density)
         log_detected = detected_log_odds(state, pairs, weight, model, of_landmark, log_odds_without)
         value = score[pairs.row] + pairs.log_position + pairs.log_feature + log_detected
         found = frame_marginals(seen.frame, pairs.row, pairs.landmark, value, log_null, associator=config.associator)
@@ -99,7 +100,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         background = np.maximum(found.null - new, 0.0)
         hits = np.bincount(pairs.landmark, weight, minlength=m).astype(np.float64)
         model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
-        log_odds = existence_log_odds(state, pairs, weight, model, of_landmark)
+        log_odds = existence_log_odds(state, pairs, weight, model, of_landmark, log_density)
         model = estimate_frame_model(
             model, seen, background, new, np.exp(log_once), of_landmark, of_detection, hit_cell, weight, expit(log_odds), hits
         )

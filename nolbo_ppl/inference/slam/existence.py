@@ -40,7 +40,12 @@ def mean_score(model: FrameModel, hits: Float[np.ndarray, " m"]) -> Float[np.nda
 
 
 def existence_log_odds(
-    state: SlamState, pairs: DetectionPairs, weight: Float[np.ndarray, " p"], model: FrameModel, exposures: Exposures
+    state: SlamState,
+    pairs: DetectionPairs,
+    weight: Float[np.ndarray, " p"],
+    model: FrameModel,
+    exposures: Exposures,
+    log_density: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " m"]:
     """Log odds of each landmark being an object rather than so many false detections.
 
@@ -53,15 +58,15 @@ def existence_log_odds(
     k, j = pairs.row, pairs.landmark
     hits = np.bincount(j, weight, minlength=m).astype(np.float64)
     probability = np.clip(model.probability(pairs.local), *PROBABILITY_LIMITS)
-    log_clutter = model.log_clutter(seen)[k]
+    log_clutter = model.log_clutter(seen, log_density)[k]
     score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
     safe = np.clip(weight, 1e-12, 1 - 1e-12)
     entropy = -safe * np.log(safe) - (1 - safe) * np.log1p(-safe)
     value = np.bincount(j, weight * (pairs.log_residual + score - log_clutter) + entropy, minlength=m).astype(np.float64)
     # Each ratio is that of one detection given all others; of n in a row, the first has none before it.
     value += np.bincount(j, weight * pairs.log_feature, minlength=m) * np.maximum(hits - 1, 0) / np.maximum(hits, 1)
-    log_density = model.log_objects(seen)[k] - np.log(probability)
-    value += np.bincount(j, weight * log_density, minlength=m) / np.maximum(hits, 1e-9)
+    log_object = model.log_objects(seen, log_density)[k] - np.log(probability)
+    value += np.bincount(j, weight * log_object, minlength=m) / np.maximum(hits, 1e-9)
     information = np.tile(1e-9 * np.eye(3), (m, 1, 1))
     R = state.estimate.T_world_camera[seen.frame[k], :3, :3]
     # What hardly any detection speaks for is as large as one detection: else its volume, and its odds, would be without bound.
@@ -79,6 +84,7 @@ def contribution(
     weight: Float[np.ndarray, " p"],
     model: FrameModel,
     exposures: Exposures,
+    log_density: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " p"]:
     """What each pair adds to its landmark's log odds of existing: taken off, the landmark is judged without the detection."""
     seen, m = state.measurements, len(state.estimate.T_world_landmark)
@@ -89,7 +95,7 @@ def contribution(
     without = np.maximum(hits[j] - weight, 0.0)
     pattern = model.log_pattern(hits, number, mean)[j] - model.log_pattern(without, number[j], mean[j])
     score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
-    return weight * (pairs.log_position + pairs.log_feature + score - model.log_clutter(seen)[k]) + pattern
+    return weight * (pairs.log_position + pairs.log_feature + score - model.log_clutter(seen, log_density)[k]) + pattern
 
 
 def detected_log_odds(

@@ -105,17 +105,20 @@ class FrameModel:
         """Log likelihood ratio of each score, object over clutter."""
         return self.score_slope * (measurements.log_object - measurements.log_clutter) + self.score_offset
 
-    def log_clutter(self, measurements: Measurements) -> Float[np.ndarray, " n"]:
-        """Log density of clutter at each detection, per m^3 and frame."""
+    def log_clutter(self, measurements: Measurements, log_density: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Log density of clutter at each detection, per m^3 and frame.
+
+        Args:
+            measurements: in camera frames.
+            log_density: `log_detection_density` of their positions. It is the costly part, and no M-step changes it.
+        """
         if self.clutter_rate is not None:
             return np.full(len(measurements), np.log(self.clutter_rate))
-        share = self.clutter_share[self.range_cell(measurements.position)]
-        return np.log(share) + self.log_detection_density(measurements.position)
+        return np.log(self.clutter_share[self.range_cell(measurements.position)]) + log_density
 
-    def log_objects(self, measurements: Measurements) -> Float[np.ndarray, " n"]:
-        """Log density of detections of objects at each detection, per m^3 and frame."""
-        share = self.clutter_share[self.range_cell(measurements.position)]
-        return np.log1p(-share) + self.log_detection_density(measurements.position)
+    def log_objects(self, measurements: Measurements, log_density: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Log density of detections of objects at each detection, per m^3 and frame; arguments as of `log_clutter`."""
+        return np.log1p(-self.clutter_share[self.range_cell(measurements.position)]) + log_density
 
     def log_pattern(
         self, hits: Float[np.ndarray, " m"], exposures: Float[np.ndarray, " m"], mean: Float[np.ndarray, " m"]

@@ -27,6 +27,12 @@ DRIFT_FACTORS = (1.0, 3.0, 0.5, 6.0)
 """Factors on odometry scales nobody stated with which the runs begin; further runs repeat them."""
 SAME_MAP = 1.0
 """Runs whose trajectories are closer than this many typical detection scales are one hypothesis."""
+SAME_EVIDENCE = 5.0
+"""Two runs at one trajectory whose log evidence is closer than this agree, nats."""
+SAME_SHARE = 0.3
+"""Two runs whose trajectories are closer than this share of `SAME_MAP` agree whatever their evidence, ..."""
+SAME_COUNT = 0.05
+"""... if their numbers of landmarks differ by no more than this share."""
 AMBIGUOUS = 0.05
 """A rival with more weight than this makes the answer ambiguous."""
 RAISED = 3.0
@@ -126,6 +132,18 @@ def run_to_end(
     return Run(replace(state, config=config), associations, infos, tuple(history), map_log_evidence(state))
 
 
+def agree(first: Run, second: Run, distance: float, same: float) -> bool:
+    """Whether two runs from different starts ended at one map: trajectories well within `same`, landmarks counted alike.
+
+    Their evidence need not agree: scales of the noise that settled a few percent apart move it by a hundred nats on a
+    drive whose maps no eye could tell apart.
+    """
+    if distance < same and abs(first.log_evidence - second.log_evidence) < SAME_EVIDENCE:
+        return True
+    counts = len(first.state.static), len(second.state.static)
+    return distance < SAME_SHARE * same and abs(counts[0] - counts[1]) <= SAME_COUNT * max(counts)
+
+
 def explore(
     state: SlamState,
     iterate: Callable[[SlamState, Callable[[SlamState, EmStepInfo], None]], tuple[SlamState, tuple[EmStepInfo, ...]]],
@@ -141,7 +159,7 @@ def explore(
             state = raised
             runs[0] = run_to_end(state, iterate, on_step)
         distance = trajectory_distance(runs[0].state.estimate.T_world_camera, runs[-1].state.estimate.T_world_camera)
-        if k == 1 and distance < same and abs(runs[0].log_evidence - runs[1].log_evidence) < 5.0:
+        if k == 1 and agree(runs[0], runs[1], distance, same):
             break
         if len(state.static) < 2:
             break
