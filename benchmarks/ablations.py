@@ -36,7 +36,7 @@ from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_config import rendered_size
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.training.stage_data import TrainingData
 from nolbo_ppl.training.stages import StageRun
 
@@ -192,7 +192,7 @@ def named_instances(settings: Settings) -> Path:
     """Folder of a data set in which each of a few instances is seen many times."""
     folder = settings.out / "named_instances"
     if not (folder / "scenes.jsonl").is_file():
-        source = SceneSource(scene_preset(settings.difficulty), seed=settings.seed, instances=settings.instances)
+        source = SceneGenerator(scene_preset(settings.difficulty), seed=settings.seed, instances=settings.instances)
         write_scenes(folder, source, settings.count, settings.workers)
     return folder
 
@@ -204,7 +204,7 @@ def seconds_a_step(config: TrainConfig) -> dict[str, float]:
     costs = {}
     for stage in config.stages():
         if stage.name != "shapes":
-            data.teach(model)
+            data.encode_shapes(model)
         stage_run, taken = StageRun(model, stage, config.bf16), []
         batches = data.batches(stage.name, 0)
         with batches if isinstance(batches, prefetch) else nullcontext():

@@ -19,12 +19,12 @@ import numpy as np
 import tyro
 from scipy.stats import beta
 
-from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.geometry.pose import relative, se3_log, so3_exp, so3_log
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.io.files import read_json, write_json
 
-LEAST_IN_BIN = 50
+MIN_IN_BIN = 50
 """Bins of reliability with fewer cases are joined to the next."""
 
 
@@ -72,7 +72,7 @@ def simulate(kind: Kind, seed: int) -> SimulatedSequence:
     """A world of this kind: a lap and a third, so that some objects are seen in two passes; objectness is exact."""
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=2, radius=22.0, frames_per_lap=45)[:60]
-    drive = simulate_drive(truth, rng, world=kind.world, detector=kind.detector, odometry_rotation_scale=0.01)
+    drive = simulate_sequence(truth, rng, world=kind.world, detector=kind.detector, odometry_rotation_scale=0.01)
     table, real = drive.observations, drive.object_of >= 0
     score = np.clip(table.objectness, 1e-6, 1 - 1e-6)
     true, false = (beta(10 * mean, 10 * (1 - mean)).pdf(score) for mean in kind.detector.objectness)
@@ -188,13 +188,13 @@ def calibrated_errors(result: SlamResult, drive: SimulatedSequence, owner: np.nd
 
 
 def reliability_gap(cases: np.ndarray, bins: int = 10) -> tuple[float, list[tuple[float, float, int]]]:
-    """Largest distance of the stated mean from the share that happened over bins of `LEAST_IN_BIN` cases, and the bins."""
+    """Largest distance of the stated mean from the share that happened over bins of `MIN_IN_BIN` cases, and the bins."""
     edges = np.linspace(0, 1, bins + 1)
     which = np.clip(np.searchsorted(edges, cases[:, 0], side="right") - 1, 0, bins - 1)
     table, rest = [], np.zeros((0, 2))
     for b in range(bins):
         rest = np.concatenate([rest, cases[which == b]])
-        if len(rest) >= LEAST_IN_BIN:
+        if len(rest) >= MIN_IN_BIN:
             table.append((float(rest[:, 0].mean()), float(rest[:, 1].mean()), len(rest)))
             rest = np.zeros((0, 2))
     if len(rest) and not table:

@@ -17,9 +17,9 @@ import numpy as np
 import tyro
 
 from nolbo_ppl.data.converters import Converted, convert_kitti_poles, convert_kitti_tracking, convert_ycbv_slam
-from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_sequence
 from nolbo_ppl.geometry.pose import inverse, relative, rotation_angle, se3_log
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online, solve_with_associations
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_incremental, solve_with_associations
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.io.trajectories import read_trajectory
 from nolbo_ppl.metrics.association import association_pairs, normalised_error_squared
@@ -96,7 +96,7 @@ def make_drive(arguments: Arguments, kind: str, seed: int) -> tuple[SimulatedSeq
     truth = read_trajectory(path).T_world_camera[:: arguments.every]
     world = WorldConfig(categories=3, instance_scale=0.0) if kind == "identical" else WorldConfig()
     rotation = 0.008 * np.sqrt(arguments.every / 5)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         truth,
         np.random.default_rng(seed),
         world=world,
@@ -142,7 +142,7 @@ def online(arguments: Arguments, seed: int) -> Row:
     """The online system's end on the drive of `simulated`, and how far it is from the batch's."""
     drive, config = make_drive(arguments, "distinct", seed)
     problem = SlamProblem(drive.odometry, drive.observations)
-    after = ate(solve_online(problem, config).T_world_camera, drive.truth)
+    after = ate(solve_incremental(problem, config).T_world_camera, drive.truth)
     batch = ate(solve(problem, config).T_world_camera, drive.truth)
     before = ate(drive.odometry, drive.truth)
     return {"before": before, "after": after, "batch": batch, "from_batch": abs(after - batch), "after/before": after / before}

@@ -21,7 +21,7 @@ import tyro
 from observation import Settings as ObservationSettings
 from observation import compare, observe_ratio, scenes, step_ratio, taught
 
-from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.association import Associator, association_marginals
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve, solve_with_associations
 from nolbo_ppl.io.files import read_json, write_json
@@ -62,7 +62,7 @@ def sequence(frames: int) -> SimulatedSequence:
     """Laps of a circle among objects: twice the frames are twice the laps."""
     random = np.random.default_rng(1)
     truth = simulate_circuit(random, laps=frames // 100, radius=20.0, frames_per_lap=100)
-    return simulate_drive(truth, random, world=WorldConfig(objects=40, categories=8))
+    return simulate_sequence(truth, random, world=WorldConfig(objects=40, categories=8))
 
 
 def slam_seconds(drive: SimulatedSequence, hypotheses: int, repeats: int = 3) -> tuple[float, float]:

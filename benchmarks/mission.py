@@ -17,9 +17,9 @@ from typing import Any, Literal
 import tyro
 
 from nolbo_ppl.io.files import write_json
-from nolbo_ppl.pipeline.mapping_pipeline import run_mission
+from nolbo_ppl.pipeline.mapping_pipeline import run_pipeline
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.synthetic.worlds import drive_preset, write_drive
+from nolbo_ppl.synthetic.worlds import sequence_preset, write_sequence_folder
 
 UNSEEN = 91_000
 """Worlds are numbered from here: neither training nor the demonstration uses them."""
@@ -37,14 +37,14 @@ FIGURES = (
     ("map", "duplicates"),
     ("map", "spurious"),
     ("map", "median_position_error"),
-    ("observation_figures", "recall"),
-    ("observation_figures", "precision"),
-    ("observation_figures", "category_accuracy"),
-    ("observation_figures", "position_error", "all", "median"),
-    ("observation_figures", "position_error", "all", "p90"),
-    ("observation_figures", "coverage90", "position"),
-    ("observation_figures", "coverage90", "orientation"),
-    ("observation_figures", "coverage90", "latent"),
+    ("observation_scores", "recall"),
+    ("observation_scores", "precision"),
+    ("observation_scores", "category_accuracy"),
+    ("observation_scores", "position_error", "all", "median"),
+    ("observation_scores", "position_error", "all", "p90"),
+    ("observation_scores", "coverage90", "position"),
+    ("observation_scores", "coverage90", "orientation"),
+    ("observation_scores", "coverage90", "latent"),
     ("shape", "iou", "1"),
     ("shape", "iou", "3"),
     ("shape", "iou", "10"),
@@ -86,10 +86,10 @@ def figure(summary: Mapping[str, Any], path: Sequence[str]) -> float | None:
 
 def run_one(arguments: Arguments, world: Literal["street", "indoor"], seed: int) -> dict[str, Any]:
     """Summary of the run of one world."""
-    drive, config = arguments.out / f"{world}-{seed}" / "drive", drive_preset(arguments.preset, world, UNSEEN + seed)
-    write_drive(config, drive, arguments.workers)
+    drive, config = arguments.out / f"{world}-{seed}" / "drive", sequence_preset(arguments.preset, world, UNSEEN + seed)
+    write_sequence_folder(config, drive, arguments.workers)
     height = config.camera_height if arguments.ground else None
-    return run_mission(
+    return run_pipeline(
         RunConfig(
             images=drive / "images",
             intrinsics=drive / "intrinsics.json",

@@ -32,7 +32,7 @@ from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import INCLUSIVE
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
-from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.io.files import write_json
 from nolbo_ppl.models.distributions import VonMisesMixture, WrappedNormal
 from nolbo_ppl.models.distributions.von_mises_kl import kl_wrapped_to_mixture
@@ -41,8 +41,8 @@ from nolbo_ppl.models.model_config import PRESETS
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
-from nolbo_ppl.training.scene_supply import to_batch
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+from nolbo_ppl.training.scene_loader import to_batch
 from nolbo_ppl.training.stages import StageRun, TrainingStage
 
 STEP_LIMIT, OBSERVE_LIMIT, WAITING_LIMIT = 1.10, 1.30, 0.05
@@ -133,7 +133,7 @@ def hand_loss(model: Nolbo, batch: SceneBatch) -> Tensor:
 class HandLoop:
     """A plain torch training loop: AdamW, clipping, and an exponential moving average of the weights."""
 
-    def __init__(self, model: Nolbo, config: OptimisationConfig, half_precision: bool) -> None:
+    def __init__(self, model: Nolbo, config: OptimizerConfig, half_precision: bool) -> None:
         self.model, self.config = model, config
         model.set_half_precision(half_precision)
         model.train()
@@ -162,7 +162,7 @@ class HandLoop:
 
 def scenes(count: int) -> SceneBatch:
     """A batch of standard training scenes."""
-    return to_batch(render_batch(SceneSource(preset("standard", 128), seed=77), 0, count))
+    return to_batch(render_batch(SceneGenerator(preset("standard", 128), seed=77), 0, count))
 
 
 def taught(model: Nolbo, batch: SceneBatch) -> SceneBatch:
@@ -192,7 +192,7 @@ def assert_same_step(batch: SceneBatch) -> None:
 
 
 def _stage(steps: int = 10**6) -> TrainingStage:
-    return TrainingStage("scenes", OptimisationConfig(steps=steps, warmup=1, decay=0.0), INCLUSIVE, freeze=steps)
+    return TrainingStage("scenes", OptimizerConfig(steps=steps, warmup=1, decay=0.0), INCLUSIVE, freeze=steps)
 
 
 def compare(name: str, ours: Callable[[], Any], bare: Callable[[], Any], pairs: int, limit: float) -> Ratio:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.slam import IncrementalSlam, SlamConfig, SlamProblem, solve
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
@@ -68,7 +68,7 @@ def drive_laps(arguments: Arguments, seed: int) -> tuple[list[Row], Row]:
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=arguments.laps, radius=arguments.radius, frames_per_lap=arguments.frames_per_lap)
     world = WorldConfig(objects=arguments.objects, categories=12, latent_dim=8)
-    drive = simulate_drive(truth, rng, world=world)
+    drive = simulate_sequence(truth, rng, world=world)
     config = SlamConfig(odometry_rotation_scale=0.004, odometry_translation_ratio=0.01)
     table = drive.observations
     order = np.argsort(table.frame, kind="stable")

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, simulate_sequence
 from nolbo_ppl.inference.slam import IncrementalSlam, SlamConfig, SlamProblem, solve, solve_with_associations
 from nolbo_ppl.io.trajectories import read_trajectory
 
@@ -38,7 +38,7 @@ def make_drive(data: Path, every: int, seed: int, frames: int | None = None) -> 
     """KITTI 00 with 400 objects of 20 categories, cut to its first frames; noise per metre does not depend on `every`."""
     truth = read_trajectory(data / "kitti_odometry" / "poses" / "00.txt").T_world_camera[::every]
     rotation = 0.008 * np.sqrt(every / 5)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         truth,
         np.random.default_rng(seed),
         odometry_rotation_scale=rotation,

@@ -23,8 +23,8 @@ from nolbo_ppl.data.simulate import (
     WorldConfig,
     simulate_circuit,
     simulate_detections,
-    simulate_drive,
     simulate_odometry,
+    simulate_sequence,
 )
 from nolbo_ppl.geometry.pose import inverse, make_pose, relative, se3_log, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_with_associations
@@ -72,7 +72,7 @@ def circuit(seed: int, arguments: Arguments) -> SimulatedSequence:
     """Two laps round 45 objects of 8 categories."""
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=2, frames_per_lap=90)
-    return simulate_drive(
+    return simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=45, categories=8, latent_dim=6),
@@ -118,7 +118,7 @@ def room(seed: int, arguments: Arguments) -> SimulatedSequence:
     return SimulatedSequence(truth, odometry, replace(table, category=names), source, world)
 
 
-def owners(result: SlamResult, object_of: np.ndarray) -> np.ndarray:
+def landmark_to_object(result: SlamResult, object_of: np.ndarray) -> np.ndarray:
     """True object most detections of each landmark are of, -1 for clutter."""
     found = result.associations
     label = np.full(len(found.new), -1)
@@ -141,7 +141,7 @@ def figures(world: SimulatedSequence, result: SlamResult, oracle_T: np.ndarray) 
     pose = normalised_error_squared(
         se3_log(relative(result.T_world_camera, world.truth))[1:], result.pose_covariances()[1:]
     ).mean()
-    owner = owners(result, world.object_of)
+    owner = landmark_to_object(result, world.object_of)
     known = np.flatnonzero(owner >= 0)
     seen = len(np.unique(world.object_of[world.object_of >= 0]))
     out = {

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from nolbo_ppl.inference.elbo import SceneELBO as SceneELBO
     from nolbo_ppl.inference.posterior.model_folder import load as load
     from nolbo_ppl.inference.posterior.predictor import ObservationModel as ObservationModel
-    from nolbo_ppl.inference.slam.incremental.online_slam import IncrementalSlam as IncrementalSlam
+    from nolbo_ppl.inference.slam.incremental.incremental_slam import IncrementalSlam as IncrementalSlam
     from nolbo_ppl.inference.slam.slam_problem import SlamConfig as SlamConfig
     from nolbo_ppl.inference.slam.slam_problem import SlamProblem as SlamProblem
     from nolbo_ppl.inference.slam.slam_result import SlamResult as SlamResult
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from nolbo_ppl.models.guide import Guide as Guide
     from nolbo_ppl.models.scene_batch import SceneBatch as SceneBatch
     from nolbo_ppl.odometry.visual_odometry import estimate_odometry as estimate_odometry
-    from nolbo_ppl.pipeline.mapping_pipeline import run_mission as run
+    from nolbo_ppl.pipeline.mapping_pipeline import run_pipeline as run
     from nolbo_ppl.pipeline.run_config import RunConfig as RunConfig
     from nolbo_ppl.structures.annotations import Annotations as Annotations
     from nolbo_ppl.structures.detections import Detections as Detections
@@ -60,7 +60,7 @@ PUBLIC: dict[str, str] = {
     "SlamProblem": "inference.slam.slam_problem:SlamProblem",
     "SlamConfig": "inference.slam.slam_problem:SlamConfig",
     "solve": "inference.slam.solve:solve",
-    "IncrementalSlam": "inference.slam.incremental.online_slam:IncrementalSlam",
+    "IncrementalSlam": "inference.slam.incremental.incremental_slam:IncrementalSlam",
     "SlamResult": "inference.slam.slam_result:SlamResult",
     "Landmark": "structures.landmark:Landmark",
     "association_marginals": "inference.association.marginals:association_marginals",
@@ -75,7 +75,7 @@ PUBLIC: dict[str, str] = {
     "TrainConfig": "training.train_config:TrainConfig",
     "evaluate": "cli.evaluate:run",
     "EvaluateConfig": "cli.evaluate:EvaluateConfig",
-    "run": "pipeline.mapping_pipeline:run_mission",
+    "run": "pipeline.mapping_pipeline:run_pipeline",
     "RunConfig": "pipeline.run_config:RunConfig",
     # errors, references
     "NolboError": "errors:NolboError",
@@ -119,8 +119,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for when it is asked for, so that `import nolbo_ppl` stays light."""
-    if name == "Observations":
-        return _moved.renamed("nolbo_ppl", {name: "ObjectPosteriors"})(name)
+    if name in _moved.RENAMED[""]:
+        return _moved.renamed(__name__)(name)
     if name not in PUBLIC:
         raise AttributeError(f"module 'nolbo_ppl' has no attribute {name!r}")
     import importlib

@@ -9,9 +9,10 @@ import importlib
 import importlib.util
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib.abc import InspectLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
+from operator import attrgetter
 from types import CodeType, ModuleType
 from typing import Any
 
@@ -90,8 +91,8 @@ MOVED = {
     "data.shapes.tubes": "synthetic.shapes.tubes",
     "data.shapes.water": "synthetic.shapes.water",
     "data.shapes.working_boats": "synthetic.shapes.working_boats",
-    "data.source": "synthetic.scenes.scene_source",
-    "data.supply": "training.scene_supply",
+    "data.source": "synthetic.scenes.scene_generator",
+    "data.supply": "training.scene_loader",
     "data.textures": "synthetic.renderer.textures",
     "data.training": "training.stage_data",
     "data.trajectories": "io.trajectories",
@@ -124,7 +125,7 @@ MOVED = {
     "inference.slam.finish": "inference.slam.map_refinement",
     "inference.slam.observe": "inference.slam.data_association",
     "inference.slam.odometry": "inference.slam.noise.odometry_noise",
-    "inference.slam.online": "inference.slam.incremental.online_slam",
+    "inference.slam.online": "inference.slam.incremental.incremental_slam",
     "inference.slam.online_graph": "inference.slam.incremental.incremental_graph",
     "inference.slam.online_loops": "inference.slam.incremental.incremental_loops",
     "inference.slam.oracle": "inference.slam.ground_truth_association",
@@ -201,6 +202,85 @@ MOVED = {
 }
 """Old name to new name of modules, both without the package's own name."""
 
+RENAMED: dict[str, dict[str, str]] = {
+    "": {"Observations": "ObjectPosteriors"},
+    "cli.slam": {"SlamArguments": "SlamRunConfig"},
+    "data.simulate": {"simulate_drive": "simulate_sequence"},
+    "evaluation.scores": {"figures": "score_intervals", "summary": "point_scores"},
+    "inference.elbo": {"SceneElbo": "SceneELBO"},
+    "inference.posterior.decoded_shapes": {"ShapeAnswer": "DecodedShape"},
+    "inference.posterior.preprocess": {
+        "Prepared": "PreprocessedImage",
+        "prepare": "preprocess",
+        "prepare_all": "preprocess_all",
+    },
+    "inference.slam": {
+        "Links": "LandmarkEqualities",
+        "ObjectSlam": "IncrementalSlam",
+        "OnlineInfo": "IncrementalInfo",
+        "PlainInfo": "ReferenceEmInfo",
+        "PlainState": "ReferenceEmState",
+        "StepInfo": "EmStepInfo",
+        "plain_init": "em_init",
+        "plain_solve": "em_solve",
+        "plain_step": "em_step",
+        "solve_online": "solve_incremental",
+    },
+    "inference.slam.graph": {
+        "LOOSE_ROTATION": "UNINFORMATIVE_ROTATION_SIGMA",
+        "Links": "LandmarkEqualities",
+        "add_links": "add_landmark_equalities",
+        "optimise": "optimize",
+        "widened": "inflated",
+    },
+    "inference.slam.incremental.incremental_slam": {
+        "ObjectSlam": "IncrementalSlam",
+        "OnlineInfo": "IncrementalInfo",
+        "solve_online": "solve_incremental",
+    },
+    "inference.slam.reference_em": {
+        "PlainInfo": "ReferenceEmInfo",
+        "PlainState": "ReferenceEmState",
+        "plain_init": "em_init",
+        "plain_solve": "em_solve",
+        "plain_step": "em_step",
+    },
+    "inference.svi": {"OptimisationConfig": "OptimizerConfig", "OptimisationState": "OptimizerState"},
+    "io.observations": {
+        "ObservationTable": "Detections",
+        "concatenate": "Detections.concatenate",
+        "make_table": "Detections.from_arrays",
+        "observation_row": "to_record",
+    },
+    "models.generative": {"Story": "GenerativeModel"},
+    "models.roi_refinement": {"Glimpse": "RoiRefinement"},
+    "models.shape_vae": {"ShapeStory": "ShapeGenerativeModel"},
+    "pipeline.mapping_pipeline": {"run_mission": "run_pipeline"},
+    "pipeline.run_inputs": {"open_drive": "open_run_inputs", "wheel_lengths": "read_step_lengths"},
+    "structures.detections": {
+        "ObservationTable": "Detections",
+        "concatenate": "Detections.concatenate",
+        "make_table": "Detections.from_arrays",
+    },
+    "structures.object_posteriors": {"Observations": "ObjectPosteriors"},
+    "synthetic.assets.shape_library": {"ShapePool": "ShapeLibrary"},
+    "synthetic.renderer.camera_view": {"Backdrop": "Environment"},
+    "synthetic.scenes.environment": {"sample_backdrop": "sample_environment"},
+    "synthetic.scenes.scene_generator": {"SceneSource": "SceneGenerator"},
+    "synthetic.worlds": {
+        "DriveConfig": "SequenceConfig",
+        "DriveObject": "SequenceObject",
+        "DriveSummary": "SequenceSummary",
+        "drive_preset": "sequence_preset",
+        "read_drive": "read_sequence_folder",
+        "write_drive": "write_sequence_folder",
+    },
+    "training.scene_loader": {"SceneSupply": "SceneLoader"},
+    "training.training_log": {"Journal": "TrainingLogger"},
+    "training.validation": {"held_out": "validate"},
+}
+"""Classes and functions by module: old name to new name, of the module or of a class in it."""
+
 
 class _MovedLoader(Loader):
     """Loads the module of the new name under the old one."""
@@ -263,14 +343,15 @@ def moved_names(package: str, module: str) -> Callable[[str], Any]:
     return get
 
 
-def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """`__getattr__` of a module whose classes have other names than in 0.1.0: the old names still work, with a warning."""
+def renamed(module: str) -> Callable[[str], Any]:
+    """`__getattr__` of a module whose names were others in 0.1.0 (`RENAMED`): those still work, with a warning."""
+    names = RENAMED[module.removeprefix("nolbo_ppl").removeprefix(".")]
 
     def get(name: str) -> Any:
-        """The class under its new name."""
+        """What the old name stands for."""
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         warnings.warn(f"{module}.{name} is now {names[name]}; the old name goes with 0.3.0", FutureWarning, stacklevel=2)
-        return getattr(importlib.import_module(module), names[name])
+        return attrgetter(names[name])(importlib.import_module(module))
 
     return get

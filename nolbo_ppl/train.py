@@ -4,9 +4,9 @@ Example:
     >>> import nolbo_ppl, pathlib, tempfile
     >>> from nolbo_ppl.synthetic.dataset_writer import write_scenes
     >>> from nolbo_ppl.synthetic.scenes.scene_config import preset
-    >>> from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+    >>> from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
     >>> folder = pathlib.Path(tempfile.mkdtemp())
-    >>> _ = write_scenes(folder / "scenes", SceneSource(preset("easy"), seed=5), 12)
+    >>> _ = write_scenes(folder / "scenes", SceneGenerator(preset("easy"), seed=5), 12)
     >>> config = nolbo_ppl.TrainConfig(
     ...     folder / "run", preset="nano", scenes=(folder / "scenes",), batch=4, workers=1,
     ...     shape_steps=2, single_steps=0, scene_steps=2)

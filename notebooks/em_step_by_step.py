@@ -23,16 +23,16 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.association import association_marginals
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, finish, init, plain_init, plain_solve, step
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, em_init, em_solve, finish, init, step
 from nolbo_ppl.inference.slam.reference_em import e_step
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
 LAP = 80
 rng = np.random.default_rng(2)
 truth = simulate_circuit(rng, laps=2, radius=35.0, frames_per_lap=LAP)
-drive = simulate_drive(
+drive = simulate_sequence(
     truth,
     rng,
     world=WorldConfig(objects=40, categories=5, latent_dim=8, category_scale=2.0, lateral=(4.0, 9.0)),
@@ -104,7 +104,7 @@ common = np.array(list(dict.fromkeys(seen_in_both)))
 
 def weights_of(T_world_camera, T_world_landmark, latent):
     """Weights of the second lap's objects for given landmarks, with the camera where it is said to be."""
-    plain = plain_init(SlamProblem(T_world_camera, table), config, T_world_landmark, latent)
+    plain = em_init(SlamProblem(T_world_camera, table), config, T_world_landmark, latent)
     _, weights, _ = e_step(plain)
     return np.array([weights[later & (drive.object_of == k)].mean(0) for k in common])
 
@@ -133,8 +133,8 @@ print(f"weight on the true landmark, mean over objects: {np.where(right, before,
 # log posterior, never falls; it climbs to a local maximum that keeps two copies of the street.
 
 # %%
-plain = plain_init(problem, config, state.estimate.T_world_landmark, state.features.latent)
-plain, infos = plain_solve(plain, iterations=8)
+plain = em_init(problem, config, state.estimate.T_world_landmark, state.features.latent)
+plain, infos = em_solve(plain, iterations=8)
 bound = [info.bound for info in infos]
 figure, axis = plt.subplots(figsize=(6, 2.6), layout="constrained")
 axis.plot(range(1, len(bound) + 1), bound, "o-", color=OWN)

@@ -34,9 +34,9 @@ from torch import nn
 
 import nolbo_ppl
 from nolbo_ppl.models.scene_batch import unpack_bits
-from nolbo_ppl.synthetic.assets.shape_library import ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import ShapeLibrary
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.viz.shape_plots import draw_shape
 from nolbo_ppl.viz.style import category_colour
 
@@ -56,7 +56,7 @@ single = dataclasses.replace(
     object_pixels=(48.0, 0.8),
     truncation_probability=0.0,
 )
-source = SceneSource(single, seed=88_003)
+source = SceneGenerator(single, seed=88_003)
 scenes = [scene for scene in map(source.render, range(220)) if len(scene.labels) == 1]
 labels = np.array([categories.index(scene.labels[0].category) for scene in scenes])
 answers = model.observe_boxes(
@@ -80,7 +80,7 @@ for axis, scene in zip(axes, scenes):
 # noise. It is given an advantage: it sees the true voxels (at 16³), at training and below, where the guide has an image.
 
 # %%
-pool = ShapePool(categories, seed=88_004)
+pool = ShapeLibrary(categories, seed=88_004)
 items = [pool.item(category, number) for category in categories for number in range(24)]
 
 

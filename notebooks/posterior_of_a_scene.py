@@ -37,14 +37,14 @@ from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_vie
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.metrics.detection import match_image
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.viz.panels import azimuth_density
 from nolbo_ppl.viz.posterior_plots import draw_observations
 from nolbo_ppl.viz.shape_plots import draw_shape, draw_uncertainty
 from nolbo_ppl.viz.style import category_colour
 
 model = nolbo_ppl.load(os.environ.get("NOLBO_MODEL", "tiny"))
-source = SceneSource(preset("standard", model.config.image_size), seed=77_001)
+source = SceneGenerator(preset("standard", model.config.image_size), seed=77_001)
 candidates = [source.render(i) for i in range(8)]
 scene = max(candidates, key=lambda one: sum(label.visibility > 0.5 for label in one.labels))
 print("objects:", ", ".join(label.category for label in scene.labels))
@@ -260,7 +260,7 @@ for x, name in ((0.2, "mean shape"), (0.5, "scale of its voxels"), (0.8, "true s
     figure.text(x, 0.96, name, ha="center")
 
 # %% [markdown]
-# `objects.mesh(i)` gives the mesh itself by marching cubes, in metres and the object's own frame; `objects.rows(...)`
+# `objects.mesh(i)` gives the mesh itself by marching cubes, in metres and the object's own frame; `objects.to_records(...)`
 # the lines that `nolbo slam` reads.
 
 # %%

@@ -40,15 +40,15 @@ from nolbo_ppl.models.model_config import nano
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.prior_predictive import prior_predictive
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
-from nolbo_ppl.training.scene_supply import to_batch
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+from nolbo_ppl.training.scene_loader import to_batch
 from nolbo_ppl.viz.shape_plots import draw_shape
 from nolbo_ppl.viz.style import category_colour
 
 torch.manual_seed(0)
 config = nano()
 single = dataclasses.replace(preset("standard", config.image_size), objects=(1, 2), empty_probability=0.0)
-batch = to_batch(render_batch(SceneSource(single, seed=7), first=0, size=16))
+batch = to_batch(render_batch(SceneGenerator(single, seed=7), first=0, size=16))
 figure, axes = plt.subplots(1, 8, figsize=(10, 1.4))
 for axis, image in zip(axes, batch.image):
     axis.imshow(image.permute(1, 2, 0))

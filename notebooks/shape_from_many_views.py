@@ -29,10 +29,10 @@ import numpy as np
 import nolbo_ppl
 from nolbo_ppl.geometry.voxels import unpack_voxels, voxel_iou
 from nolbo_ppl.inference.slam.detection_features import weighted_latents
-from nolbo_ppl.synthetic.assets.shape_library import ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import ShapeLibrary
 from nolbo_ppl.synthetic.renderer.camera_view import MeshInstance, View
 from nolbo_ppl.synthetic.renderer.materials import sample_materials
-from nolbo_ppl.synthetic.scenes.environment import sample_backdrop, sample_light
+from nolbo_ppl.synthetic.scenes.environment import sample_environment, sample_light
 from nolbo_ppl.synthetic.scenes.render_scene import Scene, SceneObject, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import preset
 from nolbo_ppl.synthetic.scenes.scene_sampler import camera_rotation
@@ -42,7 +42,7 @@ from nolbo_ppl.viz.style import category_colour
 VIEWS = 10
 model = nolbo_ppl.load(os.environ.get("NOLBO_MODEL", "tiny"))
 config = preset("easy", model.config.image_size)
-pool = ShapePool(model.config.categories, seed=88_001)  # shapes that no training has seen
+pool = ShapeLibrary(model.config.categories, seed=88_001)  # shapes that no training has seen
 
 # %% [markdown]
 # ## Ten views of one object
@@ -74,7 +74,7 @@ def view_of(item, materials, azimuth, rng, size=config.size):
         lights=lights,
         ambient_sky=sky,
         ambient_ground=ground,
-        backdrop=sample_backdrop(config, light, R_camera_world, None),
+        backdrop=sample_environment(config, light, R_camera_world, None),
     )
     thing = SceneObject(R_camera_object, centre, 1.0, item)
     return render_scene(Scene(view, (thing,), 1.0, 0.0, 0.005, int(rng.integers(2**31)), 1, 0.0, 1.0))

@@ -27,8 +27,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from nolbo_ppl.cli.slam import SlamArguments, run
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_drive
+from nolbo_ppl.cli.slam import SlamRunConfig, run
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_sequence
 from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
@@ -73,7 +73,7 @@ else:
     truth = streets(np.concatenate((corners, corners, corners[:3])))[: int(1.5 * 540 / 2)]
 
 rng = np.random.default_rng(9)
-drive = simulate_drive(
+drive = simulate_sequence(
     truth,
     rng,
     world=WorldConfig(objects=160, categories=8, instance_scale=0.8, lateral=(4.0, 10.0)),
@@ -97,7 +97,7 @@ print({name: line[name] for name in ("frame", "position", "objectness", "categor
 
 # %%
 result, summary = run(
-    SlamArguments(
+    SlamRunConfig(
         odometry=folder / "odometry.txt",
         observations=folder / "observations.jsonl",
         truth=folder / "truth.txt",

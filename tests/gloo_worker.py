@@ -63,7 +63,7 @@ def normalisation(rank: int | None) -> dict[str, Tensor]:
 
 def training(rank: int | None) -> dict[str, Tensor]:
     """State after steps of shapes, then of scenes: frozen, then free and decoding."""
-    from nolbo_ppl.inference.svi import OptimisationConfig
+    from nolbo_ppl.inference.svi import OptimizerConfig
     from nolbo_ppl.models.shape_vae import ShapeBatch
     from nolbo_ppl.training.stages import StageRun, TrainingStage, scene_weights
     from tests.factories import random_batch, tiny_config, tiny_model
@@ -82,12 +82,12 @@ def training(rank: int | None) -> dict[str, Tensor]:
         return ShapeBatch(*(part_of(value, rank, 3) for value in values))
 
     model = tiny_model(scatter=0.1)
-    quick = OptimisationConfig(steps=2, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
+    quick = OptimizerConfig(steps=2, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
     shapes = StageRun(model, TrainingStage("shapes", quick, {"shape_kl": 1.0, "voxels": 0.01}))
     for step in range(2):
         shapes.step(shapes_of(step))
-    shapes.adopt_average()
-    quick = OptimisationConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
+    shapes.load_ema()
+    quick = OptimizerConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
     weights = scene_weights("inclusive", {"rotation": 0.01, "voxels": 0.01})
     scenes = StageRun(model, TrainingStage("scenes", quick, weights, freeze=1, decode=64))
     for step in range(3):
@@ -98,11 +98,11 @@ def training(rank: int | None) -> dict[str, Tensor]:
 
 def local_run(seed: int) -> StageRun:
     """Scenes, three steps in all, averaged after every second one."""
-    from nolbo_ppl.inference.svi import OptimisationConfig
+    from nolbo_ppl.inference.svi import OptimizerConfig
     from nolbo_ppl.training.stages import StageRun, TrainingStage, scene_weights
     from tests.factories import tiny_model
 
-    quick = OptimisationConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
+    quick = OptimizerConfig(steps=3, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
     stage = TrainingStage("scenes", quick, scene_weights("inclusive"), freeze=3)
     return StageRun(tiny_model(scatter=0.1, seed=seed), stage, average_every=2)
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.geometry.pose import inverse, make_pose, matrix_to_quaternion, transform
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import pack_voxels, voxel_centres
@@ -139,7 +139,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> SimulatedDrive:
     """Two laps of a circle among twenty objects, in the format of `nolbo drive`, with odometry that drifts."""
     folder = tmp_path_factory.mktemp("drive")
     rng = np.random.default_rng(3)
-    simulated = simulate_drive(
+    simulated = simulate_sequence(
         simulate_circuit(rng, laps=2, frames_per_lap=60, radius=15.0),
         rng,
         world=WorldConfig(objects=20, categories=3, latent_dim=4, lateral=(3.0, 7.0)),

@@ -95,16 +95,16 @@ LONG = ("run(kitchen)",)
 SCENES = """
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
-write_scenes("scenes", SceneSource(preset("easy"), seed=5), 2)
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+write_scenes("scenes", SceneGenerator(preset("easy"), seed=5), 2)
 """
 SEEN = """
 import nolbo_ppl
 from pathlib import Path
 from PIL import Image
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
-source, shipped = SceneSource(preset("easy"), seed=5), nolbo_ppl.load("tiny")
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+source, shipped = SceneGenerator(preset("easy"), seed=5), nolbo_ppl.load("tiny")
 image = next(image for image in (source.render(i).image for i in range(50)) if len(shipped.observe(image, decode=False)))
 Path("scenes/images").mkdir(parents=True)
 Image.fromarray(image).save("scenes/images/000000.png")
@@ -118,9 +118,9 @@ write_trajectory("drive/odometry.txt", Trajectory(make_pose(np.tile(np.eye(3), (
 """
 DRIVE = """
 import numpy as np
-from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
 rng = np.random.default_rng(0)
-drive = simulate_drive(simulate_circuit(rng, laps=2, frames_per_lap=40), rng, world=WorldConfig(objects=25))
+drive = simulate_sequence(simulate_circuit(rng, laps=2, frames_per_lap=40), rng, world=WorldConfig(objects=25))
 odometry, seen = drive.odometry, drive.observations
 frame, position, R_camera_object, latent, names = seen.frame, seen.position, seen.rotation, seen.latent, seen.category
 """

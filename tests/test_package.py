@@ -11,12 +11,13 @@ import re
 import subprocess
 import sys
 import warnings
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
 
 import nolbo_ppl
-from nolbo_ppl._moved import MOVED
+from nolbo_ppl._moved import MOVED, RENAMED
 from nolbo_ppl.citations import REFERENCES
 from nolbo_ppl.errors import InputError
 
@@ -131,21 +132,12 @@ def test_names_of_a_module_that_became_a_room_are_found() -> None:
         _ = importlib.import_module("nolbo_ppl.io").nothing
 
 
-@pytest.mark.parametrize(
-    ("module", "old", "new"),
-    [
-        ("nolbo_ppl", "Observations", "ObjectPosteriors"),
-        ("nolbo_ppl.io.observations", "ObservationTable", "Detections"),
-        ("nolbo_ppl.models.generative", "Story", "GenerativeModel"),
-        ("nolbo_ppl.inference.elbo", "SceneElbo", "SceneELBO"),
-        ("nolbo_ppl.inference.slam", "ObjectSlam", "IncrementalSlam"),
-    ],
-)
-def test_class_names_of_the_first_version_warn_and_work(module: str, old: str, new: str) -> None:
-    home = importlib.import_module(module)
-    with pytest.warns(FutureWarning, match=f"{old} is now {new}"):
-        assert getattr(home, old) is getattr(home, new)
-    assert not hasattr(home, "Nothing")
+@pytest.mark.parametrize(("module", "old", "new"), [(m, *names) for m in sorted(RENAMED) for names in RENAMED[m].items()])
+def test_names_of_the_first_version_warn_and_work(module: str, old: str, new: str) -> None:
+    home = importlib.import_module(f"nolbo_ppl.{module}".rstrip("."))
+    with pytest.warns(FutureWarning, match=f"{old} is now {new}; the old name goes with 0.3.0"):
+        assert getattr(home, old) == attrgetter(new)(home)
+    assert not hasattr(home, "Nothing") and old not in vars(home)
 
 
 def test_importing_the_package_is_light() -> None:

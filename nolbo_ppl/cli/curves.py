@@ -17,7 +17,7 @@ SUFFIXES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
-class CurvesArguments:
+class CurvesConfig:
     """Draw metrics.jsonl of training runs, finished or not: the objective and the bound by term, figures of held-out scenes."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -26,7 +26,7 @@ class CurvesArguments:
     """The picture (.png, .svg, .pdf); curves.png in the folder of each run by default."""
 
 
-def run(arguments: CurvesArguments) -> list[Path]:
+def run(arguments: CurvesConfig) -> list[Path]:
     """Draw the runs one by one and return the pictures' paths.
 
     Raises:
@@ -49,7 +49,7 @@ def run(arguments: CurvesArguments) -> list[Path]:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line of `nolbo curves`."""
-    for path in run(tyro.cli(CurvesArguments, prog="nolbo curves", args=args)):
+    for path in run(tyro.cli(CurvesConfig, prog="nolbo curves", args=args)):
         sys.stdout.write(f"{path}\n")
 
 

@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from nolbo_ppl.synthetic.worlds import DriveConfig, drive_preset, write_drive
+from nolbo_ppl.synthetic.worlds import SequenceConfig, sequence_preset, write_sequence_folder
 
 
 @dataclass(frozen=True)
-class DriveOptions:
+class DriveConfig:
     """Render a drive with true poses and objects into a folder. Options that are not given come from the preset."""
 
     out: Path
@@ -56,22 +56,22 @@ class DriveOptions:
     """Processes; the files do not depend on it."""
 
 
-def config_of(options: DriveOptions) -> DriveConfig:
+def config_of(options: DriveConfig) -> SequenceConfig:
     """The drive the options describe. Raises `InputError` for unusable ones."""
-    base = drive_preset(options.preset, options.world, options.seed)
-    names = {field.name for field in fields(DriveConfig)}
+    base = sequence_preset(options.preset, options.world, options.seed)
+    names = {field.name for field in fields(SequenceConfig)}
     given = {name: value for name, value in asdict(options).items() if name in names and value is not None}
     return replace(base, **given)
 
 
-def run(options: DriveOptions) -> dict[str, Any]:
+def run(options: DriveConfig) -> dict[str, Any]:
     """Write the drive.
 
     Returns:
         The folder, numbers of frames, objects, seen objects, instances and labels, metres driven, and the seconds it took.
     """
     begin = time.perf_counter()
-    summary = asdict(write_drive(config_of(options), options.out, options.workers))
+    summary = asdict(write_sequence_folder(config_of(options), options.out, options.workers))
     return {**summary, "out": str(options.out), "seconds": round(time.perf_counter() - begin, 3)}
 
 
@@ -79,7 +79,7 @@ def main(args: Sequence[str] | None = None) -> dict[str, Any]:
     """Command line: parse the options and run."""
     import tyro
 
-    return run(tyro.cli(DriveOptions, prog="nolbo drive", args=args, description=__doc__))
+    return run(tyro.cli(DriveConfig, prog="nolbo drive", args=args, description=__doc__))
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
 from nolbo_ppl.evaluation.peers import OnnxPeer
 from nolbo_ppl.evaluation.photograph_run import PhotographEvaluation, PhotographScenes, evaluate_photographs
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords, concatenate
-from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_figures, retrieval_table, retrieve
-from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, figures
+from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_scores, retrieval_table, retrieve
+from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, score_intervals
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
@@ -33,7 +33,7 @@ from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 SEED = 9001
 """Default seed of generated scenes: neither the scenes nor the shapes of another seed are among them."""
@@ -125,14 +125,14 @@ def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
     return GeneratedScenes(open_source(config, model_config), config.count)
 
 
-def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneSource:
+def open_source(config: EvaluateConfig, model_config: ModelConfig) -> SceneGenerator:
     """Where generated scenes and views of instances come from."""
     cad = None
     if config.cad is not None:
         from nolbo_ppl.synthetic.assets.cad import load_cad_folder
 
         cad = tuple(load_cad_folder(config.cad, model_config.categories, up=config.cad_up, front=config.cad_front))
-    return SceneSource(
+    return SceneGenerator(
         preset(config.difficulty, rendered_size(model_config.image_size)),
         seed=config.seed,
         cad=cad,
@@ -193,7 +193,7 @@ def measure(config: EvaluateConfig, model: ObservationModel | MultiScalePredicto
     records = concatenate(objects)
     detections = measure_detections(boxes, labels, counts, answers, len(categories), regions=regions)
     rng = np.random.default_rng(config.seed)
-    estimates = figures(records, detections, len(scenes), model.config.symmetry, rng, config.resamples)
+    estimates = score_intervals(records, detections, len(scenes), model.config.symmetry, rng, config.resamples)
     return Evaluation(records, detections, estimates, len(scenes), categories)
 
 
@@ -297,7 +297,7 @@ def _evaluate(config: EvaluateConfig, folder: Path) -> Evaluation:
         views = InstanceViews(open_source(config, model.config), config.gallery, model.config.categories)
         found = measure_retrieval(config, model, views)
         rng = np.random.default_rng([config.seed, 1])
-        estimates = {**evaluation.figures, **retrieval_figures(found, rng, config.resamples)}
+        estimates = {**evaluation.figures, **retrieval_scores(found, rng, config.resamples)}
         evaluation = replace(evaluation, figures=estimates, retrieval=found)
     values = metrics(evaluation, config)
     write_json(folder / "metrics.json", values)

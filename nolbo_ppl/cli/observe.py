@@ -107,7 +107,7 @@ def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel,
                 images, config.intrinsics, threshold=config.threshold, size=config.size, batch=config.batch, seed=config.seed
             )
             for k, image, observations in zip(part, images, observed):
-                yield from observations.rows(k, frames.name(k))
+                yield from observations.to_records(k, frames.name(k))
                 if config.pictures:
                     _draw(config, folder / picture_name(frames.name(k)), image, observations, model)
             bar.update(len(part))

@@ -41,7 +41,7 @@ from nolbo_ppl.odometry import (
 
 
 @dataclass(frozen=True)
-class OdometryArguments:
+class OdometryRunConfig:
     """Simple visual odometry: motion from matched features, its length from elsewhere, a covariance for every step."""
 
     images: Path
@@ -128,7 +128,7 @@ def known_lengths(path: Path, part: Part) -> np.ndarray:
     )
 
 
-def scale_of(arguments: OdometryArguments, part: Part, truth: np.ndarray | None) -> Scale:
+def scale_of(arguments: OdometryRunConfig, part: Part, truth: np.ndarray | None) -> Scale:
     """Where lengths come from. Raises `InputError` when the option that gives them is missing."""
     if arguments.scale == "truth":
         if truth is None:
@@ -184,7 +184,7 @@ def write_odometry(out: Path, odometry: Odometry, times: np.ndarray | None, repo
     write_json(out / "odometry.json", report)
 
 
-def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
+def run(arguments: OdometryRunConfig) -> tuple[Odometry, dict[str, Any]]:
     """Read, estimate, write; returns the odometry and the report.
 
     Raises:
@@ -195,7 +195,7 @@ def run(arguments: OdometryArguments) -> tuple[Odometry, dict[str, Any]]:
         return _estimate(arguments, folder)
 
 
-def _estimate(arguments: OdometryArguments, folder: Path) -> tuple[Odometry, dict[str, Any]]:
+def _estimate(arguments: OdometryRunConfig, folder: Path) -> tuple[Odometry, dict[str, Any]]:
     frames, remarks = open_frames(arguments.images), list[str]()
     if arguments.intrinsics is None:
         first = frames.files[0] if isinstance(frames, ImageFolder) else None
@@ -239,7 +239,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
     import tyro
 
-    arguments = tyro.cli(OdometryArguments, prog="nolbo odometry", args=args)
+    arguments = tyro.cli(OdometryRunConfig, prog="nolbo odometry", args=args)
     _, report = run(arguments)
     sys.stdout.write(describe(report) + f"\nwritten to {arguments.out}\n")
 

@@ -14,7 +14,7 @@ from nolbo_ppl.report import write_report
 
 
 @dataclass(frozen=True)
-class ReportArguments:
+class ReportConfig:
     """Write report.html of a folder that `nolbo run` or `nolbo slam` wrote; what the folder lacks is left out."""
 
     run_dir: tyro.conf.Positional[Path]
@@ -31,7 +31,7 @@ class ReportArguments:
     """Heading; the name of the folder by default."""
 
 
-def run(arguments: ReportArguments) -> Path:
+def run(arguments: ReportConfig) -> Path:
     """Write the report and return its path.
 
     Raises:
@@ -51,7 +51,7 @@ def run(arguments: ReportArguments) -> Path:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line of `nolbo report`."""
-    path = run(tyro.cli(ReportArguments, prog="nolbo report", args=args))
+    path = run(tyro.cli(ReportConfig, prog="nolbo report", args=args))
     sys.stdout.write(f"{path}\n")
 
 

@@ -6,9 +6,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from nolbo_ppl.pipeline.mapping_pipeline import run_mission
+from nolbo_ppl.pipeline.mapping_pipeline import run_pipeline
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_summary import figure_table
+from nolbo_ppl.pipeline.run_summary import score_table
 
 
 def run(config: RunConfig) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def run(config: RunConfig) -> dict[str, Any]:
     Raises:
         NolboError: an input is missing, malformed, or does not fit the others; complete stages stay.
     """
-    return run_mission(config)
+    return run_pipeline(config)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -27,7 +27,7 @@ def main(args: Sequence[str] | None = None) -> None:
     config = tyro.cli(RunConfig, args=args, prog="nolbo run", description=__doc__)
     summary = run(config)
     remarks = "".join(f"\n{text}" for text in summary.get("remarks", []))
-    sys.stdout.write(figure_table(summary) + remarks + f"\nwritten to {config.out}\n")
+    sys.stdout.write(score_table(summary) + remarks + f"\nwritten to {config.out}\n")
 
 
 if __name__ == "__main__":

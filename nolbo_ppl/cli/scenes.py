@@ -13,7 +13,7 @@ from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.synthetic.assets.shape_library import INSTANCES
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ScenesConfig:
     """Processes; the images do not depend on it."""
 
 
-def source_of(config: ScenesConfig) -> SceneSource:
+def source_of(config: ScenesConfig) -> SceneGenerator:
     """The sequence of scenes the options describe. Raises `InputError` for unusable options."""
     cad = None
     if config.cad is not None:
@@ -52,7 +52,7 @@ def source_of(config: ScenesConfig) -> SceneSource:
 
         cad = tuple(load_cad_folder(config.cad, CATEGORIES, up=config.up, front=config.front))
     backgrounds = None if config.backgrounds is None else str(config.backgrounds)
-    return SceneSource(preset(config.difficulty, config.size), config.seed, config.instances, backgrounds, cad)
+    return SceneGenerator(preset(config.difficulty, config.size), config.seed, config.instances, backgrounds, cad)
 
 
 def run(config: ScenesConfig) -> dict[str, Any]:

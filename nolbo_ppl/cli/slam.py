@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import RESULT, is_result, write_result
 from nolbo_ppl.io.observations import read_observations
@@ -17,7 +19,7 @@ from nolbo_ppl.io.trajectory_tables import TableFormat
 
 
 @dataclass(frozen=True)
-class SlamArguments:
+class SlamRunConfig:
     """Correct a drifting trajectory by the objects seen along it, and map them with uncertainty."""
 
     odometry: Path
@@ -49,7 +51,7 @@ class SlamArguments:
     """Settings."""
 
 
-def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
+def run(arguments: SlamRunConfig) -> tuple[SlamResult, dict[str, object]]:
     """Read, solve, write; returns the result and the summary.
 
     Raises:
@@ -61,7 +63,7 @@ def run(arguments: SlamArguments) -> tuple[SlamResult, dict[str, object]]:
         return _solve(arguments, folder)
 
 
-def _solve(arguments: SlamArguments, folder: Path) -> tuple[SlamResult, dict[str, object]]:
+def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str, object]]:
     odometry = read_trajectory(arguments.odometry, arguments.odometry_format)
     table = read_observations(arguments.observations, frames=len(odometry))
     truth, remarks = None, []
@@ -84,9 +86,9 @@ def _solve(arguments: SlamArguments, folder: Path) -> tuple[SlamResult, dict[str
 
         model = load(arguments.model)  # before the solve: a wrong name should not cost a run
     if arguments.online:
-        from nolbo_ppl.inference.slam.incremental.online_slam import solve_online
+        from nolbo_ppl.inference.slam.incremental.incremental_slam import solve_incremental
 
-        result = solve_online(problem, arguments.config)
+        result = solve_incremental(problem, arguments.config)
     else:
         result = solve(problem, arguments.config)
     from nolbo_ppl.viz.map_plots import draw_slam_result
@@ -113,10 +115,14 @@ def describe(report: dict[str, object]) -> str:
 
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo slam`."""
-    arguments = tyro.cli(SlamArguments, prog="nolbo slam", args=args)
+    arguments = tyro.cli(SlamRunConfig, prog="nolbo slam", args=args)
     _, report = run(arguments)
     sys.stdout.write(describe(report) + f"\nwritten to {arguments.out}\n")
 
 
 if __name__ == "__main__":
     main()
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -17,7 +17,7 @@ from nolbo_ppl.report.viewer_guard import guarded_server
 
 
 @dataclass(frozen=True)
-class ViewArguments:
+class ViewerConfig:
     """Show a folder that `nolbo run` or `nolbo slam` wrote in 3D: trajectories, cameras, objects, EM under a slider."""
 
     run_dir: tyro.conf.Positional[Path]
@@ -36,7 +36,7 @@ class ViewArguments:
     """Folder of the images, where they lie outside of the run's folder; no picture from elsewhere is shown."""
 
 
-def run(arguments: ViewArguments, stop: threading.Event | None = None) -> None:
+def run(arguments: ViewerConfig, stop: threading.Event | None = None) -> None:
     """Serve the run until `stop` is set, or for ever.
 
     Raises:
@@ -62,7 +62,7 @@ def run(arguments: ViewArguments, stop: threading.Event | None = None) -> None:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line of `nolbo view`."""
-    arguments = tyro.cli(ViewArguments, prog="nolbo view", args=args)
+    arguments = tyro.cli(ViewerConfig, prog="nolbo view", args=args)
     try:
         run(arguments)
     except KeyboardInterrupt:

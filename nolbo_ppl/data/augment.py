@@ -25,7 +25,7 @@ class Augmentation:
     """Ranges and probabilities; ranges are (least, greatest)."""
 
     mirror_probability: float = 0.5
-    """Share of scenes that are mirrored, labels and shapes with the image (done by `SceneSupply`, which knows the shapes)."""
+    """Share of scenes that are mirrored, labels and shapes with the image (done by `SceneLoader`, which knows the shapes)."""
     scale: tuple[float, float] = (0.85, 1.35)
     """Zoom factor, log-uniform."""
     translation: float = 0.08

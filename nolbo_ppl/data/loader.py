@@ -15,7 +15,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ def shuffled_batches(scenes: Scenes, batch_size: int, seed: int, start: int = 0)
         yield scenes.batch(batch_indices(total, batch_size, seed, step))
 
 
-def render_batch(source: SceneSource, first: int, size: int, slots: int = SLOTS) -> Arrays:
+def render_batch(source: SceneGenerator, first: int, size: int, slots: int = SLOTS) -> Arrays:
     """Render scenes `first` to `first + size` into one batch."""
     images = np.empty((size, 3, source.config.size, source.config.size), dtype=np.uint8)
     labels = empty_labels(size, slots)
@@ -75,7 +75,7 @@ def render_batch(source: SceneSource, first: int, size: int, slots: int = SLOTS)
 
 
 def streamed_batches(
-    source: SceneSource, batch_size: int, workers: int = 1, start: int = 0, slots: int = SLOTS
+    source: SceneGenerator, batch_size: int, workers: int = 1, start: int = 0, slots: int = SLOTS
 ) -> Iterator[Arrays]:
     """Endless fresh batches from step `start` on: step s holds scenes s * batch_size onwards, never seen before.
 

@@ -31,7 +31,7 @@ def mirror(batch: SceneBatch, chosen: Bool[Tensor, " b"]) -> SceneBatch:
     """The batch with the chosen scenes mirrored. Their instance labels are -1: mirrored instances have none.
 
     Latents of the shape autoencoder are left as they are: they must be those of the mirrored voxels
-    (`nolbo_ppl.training.scene_supply.ShapeTable.add_teacher`).
+    (`nolbo_ppl.training.scene_loader.ShapeTable.add_shape_targets`).
     """
     width = batch.image.shape[-1]
     fx, fy, cx, cy = batch.intrinsics.unbind(-1)

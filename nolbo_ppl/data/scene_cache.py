@@ -34,7 +34,7 @@ VERSION = 2
 
 
 class Source(Protocol):
-    """An endless, numbered sequence of scenes (`SceneSource`, `nolbo_ppl.synthetic.worlds.world_views.ViewSource`)."""
+    """An endless, numbered sequence of scenes (`SceneGenerator`, `nolbo_ppl.synthetic.worlds.world_views.ViewSource`)."""
 
     @property
     def config(self) -> Sized:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.pose import R_WORLD_UPRIGHT, chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
-from nolbo_ppl.io.observations import Detections, make_table
+from nolbo_ppl.io.observations import Detections
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ def simulate_detections(
         category = [f"c{k}" for k in confused(kind, source, world, config, rng)]
     mean = np.where(true, config.objectness[0], config.objectness[1])
     objectness = rng.beta(10 * mean, 10 * (1 - mean)) if n else np.zeros(0)
-    table = make_table(
+    table = Detections.from_arrays(
         frame,
         position,
         position_scale=scale,
@@ -227,7 +229,7 @@ def confused(
     return np.where(mistaken, other[source], kind)
 
 
-def simulate_drive(
+def simulate_sequence(
     truth: Float[np.ndarray, "n 4 4"],
     rng: np.random.Generator,
     *,
@@ -256,3 +258,7 @@ def simulate_circuit(
     R = np.stack([np.cross(down, ahead), down, ahead], axis=-1)
     T = make_pose(R, position)
     return inverse(T[0]) @ T
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -10,19 +10,19 @@ import numpy as np
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.evaluation.labelled_scenes import annotations_of
 from nolbo_ppl.structures.annotations import Annotations
-from nolbo_ppl.synthetic.assets.shape_library import ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import ShapeLibrary
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.scenes.scene_sampler import sample_scene
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 
 STREAM = 7
 """Keeps the random numbers of views apart from those of scenes of the same seed."""
-TRIES = 50
+MAX_ATTEMPTS = 50
 """Scenes drawn for one view before it is given up: the object may find no place, or be seen too little."""
-LEAST_PIXELS = 0.375
+MIN_PIXELS = 0.375
 """Least box diagonal in a view, over image size: 48 px of 128."""
-LEAST_VISIBILITY = 0.7
+MIN_VISIBILITY = 0.7
 """Least visible share in a view."""
 
 
@@ -35,12 +35,12 @@ def view_config(config: SceneConfig) -> SceneConfig:
         clutter=(0, 0),
         truncation_probability=0.0,
         near_probability=0.0,
-        object_pixels=(LEAST_PIXELS * config.size, 0.9),
-        least_visibility=LEAST_VISIBILITY,
+        object_pixels=(MIN_PIXELS * config.size, 0.9),
+        least_visibility=MIN_VISIBILITY,
     )
 
 
-def render_view(source: SceneSource, category: str, number: int, view: int) -> Rendered:
+def render_view(source: SceneGenerator, category: str, number: int, view: int) -> Rendered:
     """Picture of instance `number` of a category; a function of the source's fields and of these arguments alone.
 
     Raises:
@@ -48,21 +48,21 @@ def render_view(source: SceneSource, category: str, number: int, view: int) -> R
     """
     config = view_config(source.config)
     # A pool of this one shape: whatever a scene draws from it is the wanted instance.
-    pool = ShapePool([category], cad=[source.pool.item(category, number).shape])
+    pool = ShapeLibrary([category], cad=[source.pool.item(category, number).shape])
     label = source.pool.categories.index(category)
-    for attempt in range(TRIES):
+    for attempt in range(MAX_ATTEMPTS):
         rng = np.random.default_rng([source.seed, STREAM, label, number, view, attempt])
         rendered = render_scene(sample_scene(config, rng, pool, source.photographs))
         if len(rendered.labels) == 1:
             return rendered
-    raise NolboError(f"no view of instance {number} of {category} in {TRIES} scenes")
+    raise NolboError(f"no view of instance {number} of {category} in {MAX_ATTEMPTS} scenes")
 
 
 @dataclass(frozen=True)
 class InstanceViews:
     """Two views of each of the first instances of every category of a source."""
 
-    source: SceneSource
+    source: SceneGenerator
     most: int
     """Instances of a category at most."""
     categories: tuple[str, ...]

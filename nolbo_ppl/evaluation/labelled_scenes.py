@@ -10,7 +10,7 @@ import numpy as np
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 
 @runtime_checkable
@@ -28,7 +28,7 @@ class Scenes(Protocol):
 class GeneratedScenes:
     """Scenes rendered when they are asked for."""
 
-    source: SceneSource
+    source: SceneGenerator
     count: int
 
     def __len__(self) -> int:

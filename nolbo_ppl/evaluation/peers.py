@@ -17,14 +17,14 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import nms
 from nolbo_ppl.models.evidence import COCO_LABELS
 
-LEAST_SCORE = 0.01
+MIN_SCORE = 0.01
 """Least score of a detection."""
 OVERLAP = 0.65
 """Boxes of one category that overlap more are one object (both projects' own setting of their COCO figures is 0.6 to 0.65)."""
 
 
 @dataclass(frozen=True)
-class PeerAnswer:
+class PeerDetections:
     """What a peer finds in one image."""
 
     box: Float[np.ndarray, "n 4"]
@@ -68,7 +68,7 @@ class OnnxPeer:
         if not self._yolox and [shape[-1] for shape in outputs] != [80] * 4 + [32] * 4:
             raise input_error("a peer", got=f"outputs of shapes {outputs}", expected="YOLOX's or PicoDet's", file=path)
 
-    def detect(self, image: UInt8[np.ndarray, "h w 3"]) -> PeerAnswer:
+    def detect(self, image: UInt8[np.ndarray, "h w 3"]) -> PeerDetections:
         """Detections of our categories, suppressed within each category, best first."""
         height, width = image.shape[:2]
         factor = self._side / max(height, width)
@@ -84,10 +84,10 @@ class OnnxPeer:
         box, score = self._decode_yolox(outputs[0][0]) if self._yolox else self._decode_picodet(outputs)
         best = score.argmax(1)
         value, label = score.max(1), self._labels[best]
-        kept = np.flatnonzero((value >= LEAST_SCORE) & (label >= 0))
+        kept = np.flatnonzero((value >= MIN_SCORE) & (label >= 0))
         box, value, label = box[kept] / np.array([size[0] / width, size[1] / height] * 2), value[kept], label[kept]
         chosen = nms(torch.as_tensor(box), torch.as_tensor(value), OVERLAP, torch.as_tensor(label)).numpy()
-        return PeerAnswer(box[chosen], value[chosen], label[chosen])
+        return PeerDetections(box[chosen], value[chosen], label[chosen])
 
     def _decode_yolox(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         corner, stride = _grid(self._side, (8, 16, 32))

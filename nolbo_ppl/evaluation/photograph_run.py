@@ -15,14 +15,14 @@ from nolbo_ppl.data.converters.photographs import Photograph, read_photographs
 from nolbo_ppl.data.sequences.image_sequence import read_image
 from nolbo_ppl.evaluation.peers import OnnxPeer
 from nolbo_ppl.evaluation.photograph_scores import (
-    PhotographAnswer,
+    PhotographDetections,
     PhotographScores,
     Viewpoints,
     counts,
     match_photographs,
     photograph_scores,
 )
-from nolbo_ppl.evaluation.scores import LEAST_OBJECTNESS
+from nolbo_ppl.evaluation.scores import MIN_OBJECTNESS
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics
@@ -39,7 +39,7 @@ class PhotographEvaluation:
     """Everything measured on photographs."""
 
     photos: list[Photograph]
-    answers: list[PhotographAnswer]
+    answers: list[PhotographDetections]
     scores: PhotographScores
     peers: dict[str, PhotographScores]
     images_per_second: float
@@ -102,7 +102,7 @@ def evaluate_photographs(
     photos = read_photographs(path, categories=categories)
     if count is not None and count < len(photos):
         photos = [photos[k] for k in np.linspace(0, len(photos) - 1, count).round().astype(int)]
-    answers: list[PhotographAnswer] = []
+    answers: list[PhotographDetections] = []
     views: list[Viewpoints] = []
     seconds = 0.0
     for first, chunk, images in _chunks(photos, batch):
@@ -110,7 +110,7 @@ def evaluate_photographs(
         found = model.observe(images, threshold=threshold, decode=False, batch=batch)
         seconds += time.perf_counter() - started
         said = [
-            PhotographAnswer(one.box, one.objectness, one.class_posterior, np.asarray(one.viewpoint[:, 0], dtype=np.float64))
+            PhotographDetections(one.box, one.objectness, one.class_posterior, np.asarray(one.viewpoint[:, 0], dtype=np.float64))
             for one in found
         ]
         answers += said
@@ -138,7 +138,7 @@ def _viewpoints(
     first: int,
     photos: Sequence[Photograph],
     images: Sequence[np.ndarray],
-    answers: Sequence[PhotographAnswer],
+    answers: Sequence[PhotographDetections],
     batch: int,
 ) -> Viewpoints:
     """Azimuths of the objects with a true viewpoint: of the detection where one matches, else at the true box."""
@@ -164,12 +164,12 @@ def _viewpoints(
     )  # fmt: skip
 
 
-def _matched_boxes(photo: Photograph, answer: PhotographAnswer, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _matched_boxes(photo: Photograph, answer: PhotographDetections, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where to look at each object: the box of the detection that matches it, else its true one; and whether one does."""
     matched = match_photographs([photo], [answer])
     boxes, seen = photo.box[slots].copy(), np.zeros(len(slots), dtype=bool)
     for k, slot in enumerate(slots):
-        hits = np.flatnonzero((matched.truth == slot) & (matched.score >= LEAST_OBJECTNESS))
+        hits = np.flatnonzero((matched.truth == slot) & (matched.score >= MIN_OBJECTNESS))
         if len(hits):
             boxes[k], seen[k] = answer.box[matched.detection[hits[0]]], True
     return boxes, seen
@@ -186,9 +186,9 @@ def _region_mass(posterior: ObjectPosteriors, azimuth: np.ndarray) -> np.ndarray
     return mixture.hpd_mass(torch.as_tensor(azimuth), torch.ones(len(azimuth), dtype=torch.long)).numpy()
 
 
-def _as_answer(peer: OnnxPeer, image: np.ndarray, labels: int) -> PhotographAnswer:
+def _as_answer(peer: OnnxPeer, image: np.ndarray, labels: int) -> PhotographDetections:
     """A peer's detections as answers: its score is the objectness, its category certain."""
     found = peer.detect(image)
     posterior = np.zeros((len(found.box), labels))
     posterior[np.arange(len(found.box)), found.label.astype(int)] = 1.0
-    return PhotographAnswer(found.box, found.score, posterior, np.full(len(found.box), np.nan))
+    return PhotographDetections(found.box, found.score, posterior, np.full(len(found.box), np.nan))

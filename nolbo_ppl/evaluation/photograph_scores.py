@@ -3,7 +3,7 @@
 Objects of 24 px and more count, crowds and difficult ones do not. A detection that matches nothing counts against a model
 only where its category is labelled exhaustively in that image: elsewhere an unlabelled object is unknown. Average precision
 is of objects of any category (pooled) and of each category with its own score; calibration is judged on the same detections,
-from `LEAST_OBJECTNESS` on.
+from `MIN_OBJECTNESS` on.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.data.converters.photographs import Photograph
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.evaluation.scores import LEAST_OBJECTNESS
+from nolbo_ppl.evaluation.scores import MIN_OBJECTNESS
 from nolbo_ppl.metrics.calibration import expected_calibration_error
 from nolbo_ppl.metrics.detection import Matches, average_precision, match
 from nolbo_ppl.metrics.intervals import IntervalEstimate, estimate, resample_weights, widened
 from nolbo_ppl.metrics.statistics import mean_of_defined, weighted_mean, weighted_median
 from nolbo_ppl.metrics.viewpoint_error import ACCURATE
 
-LEAST_SIDE = 24.0
+MIN_SIDE = 24.0
 """Longer side, px, from which on an object counts."""
 CONFIDENT = 0.5
 """Objectness from which on a detection in an image without objects is a false one."""
@@ -33,7 +33,7 @@ SIZES = {"small (24-64 px)": (24.0, 64.0), "medium (64-160 px)": (64.0, 160.0), 
 
 
 @dataclass(frozen=True)
-class PhotographAnswer:
+class PhotographDetections:
     """What a model finds in one photograph."""
 
     box: Float[np.ndarray, "n 4"]
@@ -53,7 +53,7 @@ class Viewpoints:
     mass: Float[np.ndarray, " n"]
     """Posterior mass of the region that reaches out to the truth."""
     found: Bool[np.ndarray, " n"]
-    """A detection from `LEAST_OBJECTNESS` on matches the object."""
+    """A detection from `MIN_OBJECTNESS` on matches the object."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class PhotographScores:
 def counts(photo: Photograph) -> Bool[np.ndarray, " m"]:
     """Objects that are to be found."""
     side = (photo.box[:, 2:] - photo.box[:, :2]).max(1) if len(photo.box) else np.zeros(0)
-    return (side >= LEAST_SIDE) & ~photo.ignore
+    return (side >= MIN_SIDE) & ~photo.ignore
 
 
 def match_photographs(
     photos: Sequence[Photograph],
-    answers: Sequence[PhotographAnswer],
+    answers: Sequence[PhotographDetections],
     label: int | None = None,
     sides: tuple[float, float] | None = None,
 ) -> Matches:
@@ -117,7 +117,7 @@ def match_photographs(
 
 def photograph_scores(
     photos: Sequence[Photograph],
-    answers: Sequence[PhotographAnswer],
+    answers: Sequence[PhotographDetections],
     categories: Sequence[str],
     rng: np.random.Generator,
     resamples: int = 500,
@@ -138,11 +138,11 @@ def photograph_scores(
     """
     pooled = match_photographs(photos, answers)
     if not pooled.truths.sum():
-        raise input_error("no object to evaluate on", got=f"{len(photos)} photographs", expected=f"one of {LEAST_SIDE} px")
+        raise input_error("no object to evaluate on", got=f"{len(photos)} photographs", expected=f"one of {MIN_SIDE} px")
     by_label = [match_photographs(photos, answers, label) for label in range(len(categories))]
     weights = resample_weights(len(photos), resamples, rng)
     right, confidence, scene = _categories(photos, answers, pooled)
-    judged = ~pooled.ignored & (pooled.score >= LEAST_OBJECTNESS)
+    judged = ~pooled.ignored & (pooled.score >= MIN_OBJECTNESS)
     score, correct, at = pooled.score[judged], pooled.correct[judged], pooled.scene[judged]
     empty = np.array([not len(photo.box) and len(photo.exhaustive) == len(categories) for photo in photos])
     false = np.array([int((answer.objectness > CONFIDENT).sum()) for answer in answers], dtype=np.float64)
@@ -164,7 +164,7 @@ def photograph_scores(
         "false_without_objects": estimate(lambda w: weighted_mean(false[rows], w[:, rows]), weights, len(rows)),
     }
     if viewpoints is not None and len(viewpoints.error):
-        figures |= _viewpoint_figures(viewpoints, weights)
+        figures |= _viewpoint_scores(viewpoints, weights)
     return PhotographScores(
         figures,
         {name: _row(*_of_source(photos, answers, name)) for name in sorted({photo.source for photo in photos})},
@@ -177,7 +177,7 @@ def photograph_scores(
     )
 
 
-def _viewpoint_figures(views: Viewpoints, weights: np.ndarray) -> dict[str, IntervalEstimate]:
+def _viewpoint_scores(views: Viewpoints, weights: np.ndarray) -> dict[str, IntervalEstimate]:
     scene, error = views.scene, np.abs(views.error)
 
     def share(value: np.ndarray, rows: np.ndarray) -> IntervalEstimate:
@@ -197,10 +197,10 @@ def _viewpoint_figures(views: Viewpoints, weights: np.ndarray) -> dict[str, Inte
 
 
 def _categories(
-    photos: Sequence[Photograph], answers: Sequence[PhotographAnswer], pooled: Matches
+    photos: Sequence[Photograph], answers: Sequence[PhotographDetections], pooled: Matches
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Of the objects found: whether the category is right, how sure the model is of it, and the photograph."""
-    rows = np.flatnonzero(pooled.correct & (pooled.score >= LEAST_OBJECTNESS))
+    rows = np.flatnonzero(pooled.correct & (pooled.score >= MIN_OBJECTNESS))
     right, confidence = np.zeros(len(rows)), np.zeros(len(rows))
     for k, row in enumerate(rows):
         scene = pooled.scene[row]
@@ -211,13 +211,13 @@ def _categories(
 
 
 def _of_source(
-    photos: Sequence[Photograph], answers: Sequence[PhotographAnswer], name: str
-) -> tuple[list[Photograph], list[PhotographAnswer]]:
+    photos: Sequence[Photograph], answers: Sequence[PhotographDetections], name: str
+) -> tuple[list[Photograph], list[PhotographDetections]]:
     rows = [k for k, photo in enumerate(photos) if photo.source == name]
     return [photos[k] for k in rows], [answers[k] for k in rows]
 
 
-def _row(photos: Sequence[Photograph], answers: Sequence[PhotographAnswer]) -> dict[str, float | int | None]:
+def _row(photos: Sequence[Photograph], answers: Sequence[PhotographDetections]) -> dict[str, float | int | None]:
     found = match_photographs(photos, answers)
     right, _, _ = _categories(photos, answers, found)
     return {

@@ -119,7 +119,7 @@ def retrieve(
     return RetrievalRecords(category, gallery, rank)
 
 
-def retrieval_figures(records: RetrievalRecords, rng: np.random.Generator, resamples: int = 500) -> dict[str, IntervalEstimate]:
+def retrieval_scores(records: RetrievalRecords, rng: np.random.Generator, resamples: int = 500) -> dict[str, IntervalEstimate]:
     """Recalls and the median place with 95 % intervals: bootstrap over the instances that are sought."""
     weights = resample_weights(len(records), resamples, rng)
 

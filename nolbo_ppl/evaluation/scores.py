@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords
 from nolbo_ppl.metrics.calibration import expected_calibration_error, top_label
 from nolbo_ppl.metrics.detection import Matches, average_precision
@@ -39,11 +40,11 @@ REQUIRED = (
 """The figures every evaluation reports."""
 LEVEL = 0.9
 """Probability of the posterior regions whose coverage is reported."""
-LEAST_OBJECTNESS = 0.1
+MIN_OBJECTNESS = 0.1
 """Least objectness of the detections whose calibration is judged: a host of near-zero ones would flatter the error."""
 
 
-def figures(
+def score_intervals(
     objects: ObjectRecords,
     detections: DetectionRecords,
     scenes: int,
@@ -153,7 +154,7 @@ def _objectness_error(found: Matches, weights: Float[np.ndarray, "b scenes"]) ->
 
 def judged(found: Matches) -> Bool[np.ndarray, " n"]:
     """Detections whose objectness is judged: certain enough to be seen, and not on an object that does not count."""
-    return ~found.ignored & (found.score >= LEAST_OBJECTNESS)
+    return ~found.ignored & (found.score >= MIN_OBJECTNESS)
 
 
 def _class_error(objects: ObjectRecords, weights: Float[np.ndarray, "b scenes"]) -> IntervalEstimate:
@@ -172,7 +173,7 @@ def category_table(objects: ObjectRecords, detections: DetectionRecords, categor
         table[name] = {
             "objects": int(matches.truths.sum()),
             "ap50": _defined(average_precision(matches)[0]),
-            **summary(objects.select(objects.category == label)),
+            **point_scores(objects.select(objects.category == label)),
         }
     return table
 
@@ -187,10 +188,10 @@ def difficulty_table(objects: ObjectRecords) -> dict[str, dict[str, Any]]:
         "24-48 px": (objects.side >= 24) & (objects.side < 48),
         "48 px and more": objects.side >= 48,
     }
-    return {name: {"objects": int(rows.sum()), **summary(objects.select(rows))} for name, rows in bands.items()}
+    return {name: {"objects": int(rows.sum()), **point_scores(objects.select(rows))} for name, rows in bands.items()}
 
 
-def summary(objects: ObjectRecords) -> dict[str, float | None]:
+def point_scores(objects: ObjectRecords) -> dict[str, float | None]:
     """Point estimates over some objects, all together."""
     return {
         "category_accuracy": _mean(right_category(objects)),
@@ -233,3 +234,7 @@ def _median(value: Float[np.ndarray, " n"]) -> float | None:
 
 def _defined(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
-from nolbo_ppl.evaluation.sequence_truth import DriveTruth, MatchResult
+from nolbo_ppl.evaluation.sequence_truth import MatchResult, SequenceGroundTruth
 from nolbo_ppl.geometry.alignment import known_rows, pose_alignment
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
 from nolbo_ppl.geometry.voxels import unpack_voxels
@@ -51,7 +51,7 @@ def band_name(low: float, high: float) -> str:
     return f"{low:g} m and more" if np.isinf(high) else f"{low:g}-{high:g} m"
 
 
-def matched_truth(matched: MatchResult, frame: Int[np.ndarray, " k"], truth: DriveTruth) -> dict[str, np.ndarray]:
+def matched_ground_truth(matched: MatchResult, frame: Int[np.ndarray, " k"], truth: SequenceGroundTruth) -> dict[str, np.ndarray]:
     """True position and rotation of each matched detection, NaN for the others."""
     position, rotation = np.full((len(frame), 3), np.nan), np.full((len(frame), 3, 3), np.nan)
     for k in np.flatnonzero(matched.object >= 0):
@@ -60,10 +60,10 @@ def matched_truth(matched: MatchResult, frame: Int[np.ndarray, " k"], truth: Dri
     return {"position": position, "rotation": rotation}
 
 
-def detection_figures(matched: MatchResult, table: Detections, truth: DriveTruth) -> dict[str, Any]:
+def detection_scores(matched: MatchResult, table: Detections, truth: SequenceGroundTruth) -> dict[str, Any]:
     """Recall, precision, share of right categories, median orientation error of the objects that count."""
     rows = np.flatnonzero(matched.counted)
-    true = matched_truth(matched, table.frame, truth)
+    true = matched_ground_truth(matched, table.frame, truth)
     right = [table.category[k] == truth.category[matched.object[k]] for k in rows]
     oriented = rows[table.has_rotation[rows]]
     error = rotation_error(table.rotation[oriented], true["rotation"][oriented], truth.symmetry[matched.object[oriented]])
@@ -77,7 +77,7 @@ def detection_figures(matched: MatchResult, table: Detections, truth: DriveTruth
     }
 
 
-def position_figures(
+def position_scores(
     position: Float[np.ndarray, "k 3"], true: Float[np.ndarray, "k 3"], edges: Sequence[float] = RANGES
 ) -> dict[str, dict[str, Any]]:
     """Count, median and 90th percentile of the position error (m), and of its share of the range, by true range."""
@@ -127,16 +127,16 @@ def orientation_mass(
     return posterior.hpd_mass(matrix_to_viewpoint(R)[:, 0], torch.from_numpy(symmetry)).numpy()
 
 
-def coverage_figures(
+def coverage_scores(
     matched: MatchResult,
     table: Detections,
-    truth: DriveTruth,
+    truth: SequenceGroundTruth,
     model: ShapeModel | None,
 ) -> dict[str, Any]:
     """Share of the truths inside the 90 % regions of position, orientation (azimuth) and latent."""
     rows = np.flatnonzero(matched.counted)
     out: dict[str, Any] = {"count": len(rows), "position": None, "orientation": None, "latent": None}
-    true = matched_truth(matched, table.frame, truth)
+    true = matched_ground_truth(matched, table.frame, truth)
     stated = rows[np.isfinite(table.position_covariance[rows]).all(axis=(1, 2))]
     if len(stated):
         difference = true["position"][stated] - table.position[stated]
@@ -156,7 +156,7 @@ def coverage_figures(
     return out
 
 
-def loop_figures(
+def loop_scores(
     frame: Int[np.ndarray, " k"], object_of: Int[np.ndarray, " k"], landmark_of: Int[np.ndarray, " k"], gap: int
 ) -> dict[str, Any]:
     """Precision and recall over pairs of detections more than `gap` frames apart.
@@ -180,7 +180,7 @@ def loop_figures(
     }
 
 
-def owners(
+def landmark_to_object(
     object_of: Int[np.ndarray, " k"], landmark_of: Int[np.ndarray, " k"], landmarks: int
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Object most detections of each landmark are of (-1: of none), and the share of its detections that are."""
@@ -193,12 +193,12 @@ def owners(
     return owner, purity
 
 
-def map_figures(
+def map_scores(
     object_of: Int[np.ndarray, " k"],
     owner: Int[np.ndarray, " m"],
     purity: Float[np.ndarray, " m"],
     exists: Bool[np.ndarray, " m"],
-    truth: DriveTruth,
+    truth: SequenceGroundTruth,
     least_detections: int,
 ) -> dict[str, Any]:
     """Landmarks against the objects that were detected often enough to be mapped."""
@@ -219,7 +219,7 @@ def map_figures(
 def landmark_errors(
     position: Float[np.ndarray, "m 3"],
     owner: Int[np.ndarray, " m"],
-    truth: DriveTruth,
+    truth: SequenceGroundTruth,
     estimate: Float[np.ndarray, "n 4 4"],
     T_world_camera: Float[np.ndarray, "n 4 4"],
 ) -> Float[np.ndarray, " m"]:
@@ -234,11 +234,11 @@ def landmark_errors(
     return np.where(known, np.linalg.norm(placed - truth.T_world_object[owner, :3, 3], axis=1), np.nan)
 
 
-def shape_figures(
+def shape_scores(
     table: Detections,
     landmark_of: Int[np.ndarray, " k"],
     owner: Int[np.ndarray, " m"],
-    truth: DriveTruth,
+    truth: SequenceGroundTruth,
     model: ShapeModel,
     rng: np.random.Generator,
     views: Sequence[int] = VIEWS,

@@ -21,7 +21,7 @@ IOU = 0.5
 
 
 @dataclass(frozen=True)
-class DriveTruth:
+class SequenceGroundTruth:
     """True objects of a drive."""
 
     names: tuple[str, ...]
@@ -61,7 +61,7 @@ def _with_pose(seen: Annotations, file: Path) -> Annotations:
     return seen
 
 
-def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
+def read_ground_truth(folder: Path, images: Sequence[str]) -> SequenceGroundTruth:
     """True objects of a drive folder, frame by frame for the given images.
 
     Args:
@@ -71,9 +71,9 @@ def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
     Raises:
         InputError: a file is missing or malformed, or an image is not one of the drive's.
     """
-    from nolbo_ppl.synthetic.worlds import read_drive  # delayed: it brings the renderer
+    from nolbo_ppl.synthetic.worlds import read_sequence_folder  # delayed: it brings the renderer
 
-    drive = read_drive(folder)
+    drive = read_sequence_folder(folder)
     things = drive.objects
     by_image = {seen.file.name: seen for seen in drive.frames if seen.file is not None}
     missing = [image for image in images if Path(image).name not in by_image]
@@ -83,7 +83,7 @@ def read_truth(folder: Path, images: Sequence[str]) -> DriveTruth:
     without = sorted({thing.instance for thing in things} - set(packed))
     if without:
         raise input_error("a true shape is missing", got=without[0], expected="a grid for every instance", file=folder)
-    return DriveTruth(
+    return SequenceGroundTruth(
         names=tuple(thing.id for thing in things),
         category=tuple(thing.category for thing in things),
         instance=tuple(thing.instance for thing in things),
@@ -124,7 +124,7 @@ class MatchResult:
 
 
 def object_shown(
-    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], truth: DriveTruth, least_overlap: float
+    frame: Int[np.ndarray, " k"], box: Float[np.ndarray, "k 4"], truth: SequenceGroundTruth, least_overlap: float
 ) -> Int[np.ndarray, " k"]:
     """Number of the object each detection overlaps most, -1 where none reaches `least_overlap` (IoU).
 
@@ -144,7 +144,7 @@ def match_detections(
     frame: Int[np.ndarray, " k"],
     box: Float[np.ndarray, "k 4"],
     objectness: Float[np.ndarray, " k"],
-    truth: DriveTruth,
+    truth: SequenceGroundTruth,
     iou_threshold: float = IOU,
 ) -> MatchResult:
     """Match detections with the objects of their frames, greedily by objectness, at most one an object (as COCO does)."""

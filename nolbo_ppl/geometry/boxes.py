@@ -69,7 +69,7 @@ def suppress(
     return order[torch.tensor(kept, dtype=torch.long)], stands_for
 
 
-LEAST_SIDE = 1.0
+MIN_SIDE = 1.0
 """Shortest side, px, of a box that says where in an image something is."""
 
 
@@ -101,7 +101,7 @@ def boxes_in_image(boxes: object, size: tuple[int, int], image: int = 0) -> Floa
     finite = np.isfinite(found).all(axis=1)
     ordered = finite & (found[:, 0] < found[:, 2]) & (found[:, 1] < found[:, 3])
     inside = ordered & (cut[:, 2] > cut[:, 0]) & (cut[:, 3] > cut[:, 1])
-    wide = inside & (np.minimum(cut[:, 2] - cut[:, 0], cut[:, 3] - cut[:, 1]) >= LEAST_SIDE)
+    wide = inside & (np.minimum(cut[:, 2] - cut[:, 0], cut[:, 3] - cut[:, 1]) >= MIN_SIDE)
     for good, expected, do in (
         (finite, "finite x0 y0 x1 y1", None),
         (ordered, "x0 < x1 and y0 < y1", "corners, not a corner with width and height"),

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from pyro import poutine
@@ -324,4 +324,5 @@ class SceneLoss(torch.nn.Module):
         return self.elbo.evaluate(self.story, self.guide, scene, scenes=len(batch.image), decode=decode)
 
 
-__getattr__ = renamed(__name__, {"SceneElbo": "SceneELBO"})
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -53,7 +53,7 @@ class MuonAdamW(torch.optim.Optimizer):
         pace: rate of Muon's matrices over that of the others.
     """
 
-    def __init__(self, module: nn.Module, lr: float, weight_decay: float, pace: float = 1.0) -> None:
+    def __init__(self, module: nn.Module, lr: float, weight_decay: float, matrix_lr_scale: float = 1.0) -> None:
         hidden = list(hidden_matrices(module).values())
         taken = {id(p) for p in hidden}
         others = [p for p in module.parameters() if p.requires_grad and id(p) not in taken]
@@ -62,7 +62,7 @@ class MuonAdamW(torch.optim.Optimizer):
         for part in rest:
             groups += [{name: group[name] for name in ("params", "weight_decay")} for group in part.param_groups]
         super().__init__(groups, {"lr": lr})
-        self.pace = pace
+        self.matrix_lr_scale = matrix_lr_scale
         self._hidden = hidden
         self._flat = [nn.Parameter(p.detach().flatten(1).clone()) for p in hidden]
         self._parts: list[torch.optim.Optimizer] = []
@@ -89,7 +89,7 @@ class MuonAdamW(torch.optim.Optimizer):
         for part in self._parts:
             muon = isinstance(part, torch.optim.Muon)
             for group in part.param_groups:
-                group["lr"] = rate * self.pace if muon else rate
+                group["lr"] = rate * self.matrix_lr_scale if muon else rate
             part.step()
         for p, flat in zip(self._hidden, self._flat):
             p.copy_(flat.view_as(p))

@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 import torch.distributed as distributed
 from torch import Tensor, nn
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.inference.elbo import ElboResult
 from nolbo_ppl.inference.muon import MuonAdamW, adamw
@@ -23,7 +24,7 @@ from nolbo_ppl.io.tensors import optimizer_tensors, restore_optimizer
 
 
 @dataclass(frozen=True)
-class OptimisationConfig:
+class OptimizerConfig:
     """Optimiser and schedule of one stage."""
 
     steps: int = 1000
@@ -44,12 +45,12 @@ class OptimisationConfig:
     """Decay of the moving average of the weights."""
     optimizer: Literal["muon", "adamw"] = "adamw"
     """AdamW, or Muon on hidden kernels and matrices with AdamW on all else (`nolbo_ppl.inference.muon`)."""
-    pace: float = 4.0
+    matrix_lr_scale: float = 4.0
     """Rate of Muon's matrices over `learning_rate`."""
 
 
 @dataclass
-class OptimisationState:
+class OptimizerState:
     """Everything a step changes."""
 
     module: nn.Module
@@ -57,7 +58,7 @@ class OptimisationState:
     loss: Callable[..., ElboResult]
     """What is called with a batch: a `SceneLoss`, or a distributed wrapper of one."""
     optimizer: torch.optim.Optimizer
-    config: OptimisationConfig
+    config: OptimizerConfig
     average: dict[str, Tensor]
     """Moving average of the module's state, by name."""
     step: int = 0
@@ -77,7 +78,7 @@ class StepInfo:
     """Weighted terms' own values, nats summed over the batch."""
 
 
-def learning_rate(config: OptimisationConfig, step: int) -> float:
+def learning_rate(config: OptimizerConfig, step: int) -> float:
     """Rate of a step (from 0): linear warm-up, plateau, cosine to 2 % at the end."""
     if step < config.warmup:
         return config.start_rate + (config.learning_rate - config.start_rate) * (step + 1) / config.warmup
@@ -88,20 +89,20 @@ def learning_rate(config: OptimisationConfig, step: int) -> float:
     return config.learning_rate * (0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2)
 
 
-def init(module: nn.Module, loss: Callable[..., ElboResult], config: OptimisationConfig) -> OptimisationState:
+def init(module: nn.Module, loss: Callable[..., ElboResult], config: OptimizerConfig) -> OptimizerState:
     """State before the first step: the optimiser over the parameters that require a gradient."""
     average = {name: value.detach().clone() for name, value in module.state_dict().items()}
-    return OptimisationState(module, loss, make_optimizer(module, config), config, average)
+    return OptimizerState(module, loss, make_optimizer(module, config), config, average)
 
 
-def make_optimizer(module: nn.Module, config: OptimisationConfig) -> torch.optim.Optimizer:
+def make_optimizer(module: nn.Module, config: OptimizerConfig) -> torch.optim.Optimizer:
     """The optimiser a configuration names, over the parameters that require a gradient."""
     if config.optimizer == "muon":
-        return MuonAdamW(module, config.learning_rate, config.weight_decay, config.pace)
+        return MuonAdamW(module, config.learning_rate, config.weight_decay, config.matrix_lr_scale)
     return adamw((p for p in module.parameters() if p.requires_grad), config.learning_rate, config.weight_decay)
 
 
-def step(state: OptimisationState, *args: Any, **kwargs: Any) -> tuple[OptimisationState, StepInfo]:
+def step(state: OptimizerState, *args: Any, **kwargs: Any) -> tuple[OptimizerState, StepInfo]:
     """One optimiser step on a batch; the state is changed in place and returned.
 
     Raises:
@@ -133,7 +134,7 @@ def step(state: OptimisationState, *args: Any, **kwargs: Any) -> tuple[Optimisat
 
 
 @torch.no_grad()
-def _update_average(state: OptimisationState) -> None:
+def _update_average(state: OptimizerState) -> None:
     """Moving average with a short memory at the start, so that the first weights do not linger."""
     decay = min(state.config.ema, (1 + state.step) / (10 + state.step))
     current = state.module.state_dict()
@@ -145,7 +146,7 @@ def _update_average(state: OptimisationState) -> None:
 
 
 @torch.no_grad()
-def average_over_processes(state: OptimisationState) -> None:
+def average_over_processes(state: OptimizerState) -> None:
     """Give every process the mean of all: weights, normalisation's statistics, moving average, optimiser's state."""
     moments = [value for of in state.optimizer.state.values() for value in of.values()]
     tensors = [*state.module.state_dict().values(), *state.average.values(), *moments]
@@ -157,7 +158,7 @@ def average_over_processes(state: OptimisationState) -> None:
         value.copy_(mean.view_as(value))
 
 
-def state_tensors(state: OptimisationState) -> dict[str, Tensor]:
+def state_tensors(state: OptimizerState) -> dict[str, Tensor]:
     """Copies of all tensors of a state, for a checkpoint: `model/...`, `average/...`, `optimizer/...`."""
     names = {id(p): name for name, p in state.module.named_parameters()}
     return {
@@ -177,10 +178,14 @@ def module_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return part_of(tensors, "model/")
 
 
-def restore(state: OptimisationState, tensors: dict[str, Tensor], at_step: int) -> OptimisationState:
+def restore(state: OptimizerState, tensors: dict[str, Tensor], at_step: int) -> OptimizerState:
     """Put a state back to what `state_tensors` saved, bit for bit."""
     state.module.load_state_dict(module_tensors(tensors))
     state.average = {name: value.clone() for name, value in part_of(tensors, "average/").items()}
     restore_optimizer(state.optimizer, part_of(tensors, "optimizer/"), dict(state.module.named_parameters()))
     state.step = at_step
     return state
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

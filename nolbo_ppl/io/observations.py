@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from nolbo_ppl.io.fields import is_number, is_whole, number_array
 from nolbo_ppl.io.files import read_jsonl, write_jsonl
 from nolbo_ppl.structures.detection_checks import MAX_POSITION, check_table
 from nolbo_ppl.structures.detection_records import to_records
-from nolbo_ppl.structures.detections import ARRAYS, Detections, concatenate, heaviest_mode, make_table, merged_order, padding
+from nolbo_ppl.structures.detections import ARRAYS, Detections, heaviest_mode, merged_order, padding
 
 FIELDS = (
     "frame",
@@ -335,7 +335,7 @@ def write_observations(path: str | PathLike[str], detections: Detections) -> Non
     write_jsonl(path, to_records(detections))
 
 
-def observation_row(table: Detections, i: int) -> dict[str, Any]:
+def to_record(table: Detections, i: int) -> dict[str, Any]:
     """One row of a table in the form of the file."""
     return next(to_records(table.select(np.array([i]))))
 
@@ -343,11 +343,10 @@ def observation_row(table: Detections, i: int) -> dict[str, Any]:
 __all__ = [
     "Detections",
     "check_table",
-    "concatenate",
-    "make_table",
     "read_observations",
     "write_observations",
 ]
 
 
-__getattr__ = renamed(__name__, {"ObservationTable": "Detections"})
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

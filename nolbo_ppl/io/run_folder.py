@@ -169,7 +169,7 @@ class RunFolder:
         """True poses in the run's own world: moved rigidly onto the estimate."""
         return None if self.truth_given is None else align(self.truth_given, self.estimate, "pose")
 
-    def write_truth(self, T_world_camera: Poses) -> None:
+    def write_ground_truth(self, T_world_camera: Poses) -> None:
         """Write `truth.txt`."""
         write_trajectory(self.path / "truth.txt", Trajectory(T_world_camera))
         self.__dict__.pop("truth_given", None)

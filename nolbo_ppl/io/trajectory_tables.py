@@ -20,7 +20,7 @@ frame or time; `tum` time, position, quaternion x y z w; `euroc` time in ns, pos
 EXPECTED = "12 (KITTI), 16 (4 x 4) or 8 (TUM, EuRoC)"
 MOST_FRAMES = 10_000_000
 """Whole numbers below count frames; from there on they are times in ns, µs or ms."""
-FARTHEST = 1e9
+MAX_DISTANCE = 1e9
 """Largest coordinate, m: beyond, squares of distances lose what is asked for, and singular values do not converge."""
 _UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Times above are no seconds: 1e11 s after 1970 is the year 5138."""
@@ -205,10 +205,10 @@ def _check_lost(path: Path, rows: np.ndarray, lines: np.ndarray, lost: bool) -> 
             file=path,
             line=int(lines[k]),
         )
-    far = np.abs(np.where(finite, rows, 0.0)).max(axis=1) > FARTHEST
+    far = np.abs(np.where(finite, rows, 0.0)).max(axis=1) > MAX_DISTANCE
     if far.any():
         k = int(np.argmax(far))
-        raise input_error("a value is out of range", expected=f"within {FARTHEST:g}", file=path, line=int(lines[k]))
+        raise input_error("a value is out of range", expected=f"within {MAX_DISTANCE:g}", file=path, line=int(lines[k]))
     return finite.all(axis=1)
 
 

@@ -19,7 +19,7 @@ SIDE = 112
 """Height and width of a crop, px."""
 BOX_SIDE = 88.0
 """Longer side of the object's box in it, px."""
-LEAST_SIDE = 8.0
+MIN_SIDE = 8.0
 """Boxes smaller than this, px, are looked at as if they were of this size."""
 LEVELS = 4
 """The image and its halves, quarters and eighths: a large object is cut from where it is nearest to the crop's size."""
@@ -54,7 +54,7 @@ def cut_out(levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tenso
     """
     centre = (box[:, :2] + box[:, 2:]) / 2
     extent = (box[:, 2:] - box[:, :2]).clamp_min(1e-3)
-    factor = BOX_SIDE / extent.amax(-1).clamp_min(LEAST_SIDE)
+    factor = BOX_SIDE / extent.amax(-1).clamp_min(MIN_SIDE)
     level = (-torch.log2(factor)).round().long().clamp(0, len(levels) - 1)
     step = torch.arange(SIDE, dtype=box.dtype) + 0.5 - SIDE / 2
     y, x = torch.meshgrid(step, step, indexing="ij")

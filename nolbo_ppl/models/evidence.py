@@ -35,7 +35,7 @@ TRUCK = 7
 WEAK = -6.0
 """Regions of which both sources say less than this (log odds) are not weighed: hardly one of them describes an object, and nine
 of ten regions are of this kind."""
-LEAST_LOG = -9.0
+MIN_LOG = -9.0
 """Log odds and log probabilities below this are as good as none."""
 
 
@@ -46,7 +46,7 @@ class Evidence:
     found: Float[Tensor, "b k"]
     """1 where it says anything."""
     log_odds: Float[Tensor, "b k"]
-    """That the region describes an object; `LEAST_LOG` where it says nothing."""
+    """That the region describes an object; `MIN_LOG` where it says nothing."""
     labels: Float[Tensor, "b k l"]
     """Log probability of each category, and of others that the source knows."""
     box: Float[Tensor, "b k 4"]
@@ -111,8 +111,8 @@ def gather_evidence(
     seen = found[..., None]
     return Evidence(
         found.to(box.dtype),
-        torch.where(found, log_odds.gather(1, index), LEAST_LOG).clamp_min(LEAST_LOG),
-        torch.where(seen, at(labels), -math.log(labels.shape[-1])).clamp_min(LEAST_LOG),
+        torch.where(found, log_odds.gather(1, index), MIN_LOG).clamp_min(MIN_LOG),
+        torch.where(seen, at(labels), -math.log(labels.shape[-1])).clamp_min(MIN_LOG),
         torch.where(seen, at(box), empty),
         torch.where(seen, at(features), 0.0),
     )

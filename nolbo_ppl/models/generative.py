@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyro
 import pyro.distributions as dist
@@ -47,7 +47,7 @@ from nolbo_ppl.models.scene_batch import SceneBatch, unpack_bits
 from nolbo_ppl.models.shape_networks import VoxelDecoder
 
 
-def conjugate_truth(observed: Float[Tensor, "*n d"], scale: float) -> TorchDistributionMixin:
+def conjugate_target(observed: Float[Tensor, "*n d"], scale: float) -> TorchDistributionMixin:
     """p(z | y) of z ~ N(0, 1), y ~ N(z, scale^2): N(y / (1 + scale^2), scale^2 / (1 + scale^2)), per dimension."""
     shrink = 1 / (1 + scale**2)
     return dist.Normal(observed * shrink, torch.full_like(observed, scale * math.sqrt(shrink))).to_event(1)
@@ -61,7 +61,7 @@ def expected_normal_log_prob(
     return -0.5 * (deviation + math.log(2 * math.pi * scale**2)).sum(-1)
 
 
-def tilt_kl(truth: ViewpointNormal | ViewpointSinCos, q: dist.TorchDistribution) -> Float[Tensor, "*n"]:
+def elevation_inplane_kl(truth: ViewpointNormal | ViewpointSinCos, q: dist.TorchDistribution) -> Float[Tensor, "*n"]:
     """KL(p || q) of elevation and in-plane rotation alone, nats: the angles are independent in both."""
     loc, scale = truth.loc[..., 1:], truth.scale[..., 1:]
     if isinstance(q, ViewpointMixture):
@@ -123,8 +123,8 @@ class GenerativeModel(nn.Module):
             else:
                 prior = ViewpointNormal(batch.viewpoint, scale, order=batch.symmetry)
             parts = {
-                "azimuth_inclusive": lambda q: kl_divergence(prior, q) - tilt_kl(prior, q),
-                "tilt_inclusive": lambda q: tilt_kl(prior, q),
+                "azimuth_inclusive": lambda q: kl_divergence(prior, q) - elevation_inplane_kl(prior, q),
+                "tilt_inclusive": lambda q: elevation_inplane_kl(prior, q),
             }
             value = pyro.sample("orientation_latent", prior, infer={"target": prior, "target_parts": parts})
             angles = torch.atan2(value[..., 0], value[..., 1]) if config.orientation == "sincos" else value
@@ -145,7 +145,7 @@ class GenerativeModel(nn.Module):
         ):
             with poutine.mask(mask=where.assigned if mask is None else mask):
                 zero = torch.zeros_like(observed)
-                truth = conjugate_truth(observed, scale)
+                truth = conjugate_target(observed, scale)
                 z = pyro.sample(f"{name}_latent", dist.Normal(zero, zero + 1).to_event(1), infer={"target": truth})
                 pyro.sample(
                     name,
@@ -235,4 +235,5 @@ def voxel_site(logits: Float[Tensor, "*draws n v v v"], observed: Float[Tensor, 
         pyro.sample("voxels", dist.Bernoulli(logits=logits, validate_args=False).to_event(3), obs=observed)
 
 
-__getattr__ = renamed(__name__, {"Story": "GenerativeModel"})
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

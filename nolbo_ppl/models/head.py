@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from nolbo_ppl.models.layers import OutputLinear
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
-from nolbo_ppl.models.roi_refinement import Glimpse
+from nolbo_ppl.models.roi_refinement import RoiRefinement
 from nolbo_ppl.models.scene_batch import decode_box, encode_box
 from nolbo_ppl.models.shape_networks import bounded_exp
 
@@ -50,9 +50,9 @@ class RegionHead(nn.Module):
             )
             nn.init.constant_(self.objectness.bias, -4.0)
             nn.init.normal_(last.weight, std=0.02)
-        self.glimpse: Glimpse | None = None
+        self.glimpse: RoiRefinement | None = None
         if config.glimpse:
-            self.glimpse = Glimpse(fine_channels, fine_strides, sum(self.sizes) - self.sizes[4], config)
+            self.glimpse = RoiRefinement(fine_channels, fine_strides, sum(self.sizes) - self.sizes[4], config)
         self.register_buffer("start", self._start(), persistent=False)
 
     def box_latent(self, raw: Float[Tensor, "*n outputs"]) -> Float[Tensor, "*n 4"]:

@@ -9,7 +9,7 @@ from nolbo_ppl.models.generative import GenerativeModel
 from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.model_config import ModelConfig
-from nolbo_ppl.models.shape_vae import ShapeGuide, ShapeStory
+from nolbo_ppl.models.shape_vae import ShapeGenerativeModel, ShapeGuide
 
 
 class Nolbo(nn.Module):
@@ -28,9 +28,9 @@ class Nolbo(nn.Module):
             part.half_precision = enabled
 
     @property
-    def shape_story(self) -> ShapeStory:
+    def shape_model(self) -> ShapeGenerativeModel:
         """The story of shapes alone, sharing prior and decoder."""
-        return ShapeStory(self.story)
+        return ShapeGenerativeModel(self.story)
 
     @classmethod
     def from_seed(cls, config: ModelConfig, seed: int) -> Nolbo:

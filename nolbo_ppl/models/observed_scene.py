@@ -57,7 +57,7 @@ class RegionParameters:
     range_scale: Float[Tensor, "*n 4"]
     """Scale of the range latent."""
 
-    def at_mode(self, prior_mean: Float[Tensor, "labels d"]) -> RegionParameters:
+    def at_map_category(self, prior_mean: Float[Tensor, "labels d"]) -> RegionParameters:
         """The same with the shape latent's mean where the likeliest category puts it.
 
         The guide's one Gaussian lies between categories it hesitates about (`RegionHead.parameters_of`), where no shape is:

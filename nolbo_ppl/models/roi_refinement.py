@@ -8,24 +8,26 @@ the encoder once: the grid is read from the encoder's own finer maps.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.models.layers import OutputLinear
 from nolbo_ppl.models.model_config import ModelConfig
 
 MARGIN = 1.2
 """The grid covers the box enlarged by this factor, so that its surroundings are seen too."""
-LEAST_SIDE = 8.0
+MIN_SIDE = 8.0
 """Least side of the enlarged box, px."""
 
 
-def glimpse_grid(box: Float[Tensor, "n 4"], side: int) -> Float[Tensor, "n side side 2"]:
+def roi_grid(box: Float[Tensor, "n 4"], side: int) -> Float[Tensor, "n side side 2"]:
     """Points (x, y), px, of a regular grid over each enlarged box, row by row: the centres of `side` x `side` parts."""
     centre = (box[:, :2] + box[:, 2:]) / 2
-    extent = ((box[:, 2:] - box[:, :2]) * MARGIN).clamp_min(LEAST_SIDE)
+    extent = ((box[:, 2:] - box[:, :2]) * MARGIN).clamp_min(MIN_SIDE)
     step = (torch.arange(side, dtype=box.dtype) + 0.5) / side - 0.5
     y, x = torch.meshgrid(step, step, indexing="ij")
     return centre[:, None, None] + torch.stack((x, y), -1) * extent[:, None, None]
@@ -60,7 +62,7 @@ def sample_map(
     return torch.lerp(upper, lower, fy.to(table.dtype))
 
 
-class GlimpseBlock(nn.Module):
+class RoiRefinementBlock(nn.Module):
     """Two 3 x 3 convolutions beside the identity, which they are at the start of training."""
 
     def __init__(self, width: int) -> None:
@@ -80,7 +82,7 @@ class GlimpseBlock(nn.Module):
         return x + self.branch(x)
 
 
-class Glimpse(nn.Module):
+class RoiRefinement(nn.Module):
     """Features sampled over a box -> what is added to the cell's raw outputs; little at the start of training.
 
     Args:
@@ -99,7 +101,7 @@ class Glimpse(nn.Module):
             nn.Conv2d(sum(channels[: config.glimpse_maps]), width, 3, padding=1, bias=False),
             nn.GroupNorm(4, width),
             nn.GELU(),
-            *(GlimpseBlock(width) for _ in range(config.glimpse_blocks)),
+            *(RoiRefinementBlock(width) for _ in range(config.glimpse_blocks)),
             nn.Conv2d(width, width, 3, 2, 1, bias=False),
             nn.GroupNorm(4, width),
             nn.GELU(),
@@ -138,7 +140,11 @@ class Glimpse(nn.Module):
         maps: Sequence[Tensor], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"], side: int, strides: Sequence[int]
     ) -> Float[Tensor, "n c side side"]:
         """Samples of the maps of the given strides on a grid over each box."""
-        points = glimpse_grid(box, side).flatten(1, 2)
+        points = roi_grid(box, side).flatten(1, 2)
         seen = [sample_map(m, row, points, stride) for m, stride in zip(maps, strides)]
         patch = torch.cat(seen, -1).unflatten(1, (side, side)).permute(0, 3, 1, 2)
         return patch.contiguous(memory_format=torch.channels_last)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

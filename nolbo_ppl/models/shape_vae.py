@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import pyro
 import pyro.distributions as dist
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.models.distributions import NoisyNormal
 from nolbo_ppl.models.generative import GenerativeModel, voxel_site
 from nolbo_ppl.models.model_config import ModelConfig
@@ -32,7 +34,7 @@ class ShapeBatch:
     """Standard normal noise of the latent's sample."""
 
 
-class ShapeStory(nn.Module):
+class ShapeGenerativeModel(nn.Module):
     """The part of the story that makes voxels from labels; shares prior and decoder with the story of scenes."""
 
     def __init__(self, story: GenerativeModel) -> None:
@@ -70,9 +72,13 @@ class ShapeGuide(nn.Module):
         return self.encoder(unpack_bits(packed, self.config.voxel_size).to(dtype))
 
     def forward(self, batch: ShapeBatch) -> None:
-        """The Pyro guide of `ShapeStory`."""
+        """The Pyro guide of `ShapeGenerativeModel`."""
         declare_parameters("guide", self)
         loc, scale = self.posterior(batch.voxels)
         noise = None if batch.noise is None else batch.noise[None]
         with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(loc), dim=-1):
             pyro.sample("shape_latent", NoisyNormal(loc[None], scale[None], noise).to_event(1))
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

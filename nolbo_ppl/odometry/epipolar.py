@@ -19,7 +19,7 @@ FREEDOM = 5.0
 """Degrees of freedom of the Student t that weights residuals: mismatches have long tails."""
 GATE = 4.0
 """Residuals beyond this many standard deviations are no inliers."""
-LEAST_SCALE = 0.02
+MIN_SCALE = 0.02
 """Least standard deviation of a corner, px: synthetic images can fit to rounding."""
 LEVERAGE = 3.0
 """A match pulls at the direction of translation at most so many times as much as the usual one."""
@@ -177,7 +177,7 @@ def refine(
         inside = np.abs(residual) < limit
         if inside.sum() < 8:
             break
-        scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE)
+        scale = max(MAD * float(np.median(np.abs(residual[inside]))), MIN_SCALE)
         leverage = leverage_weights(jacobian, inside) * inside
         weight = student_weights(residual, scale) * leverage
         normal = (jacobian * weight[:, None]).T @ jacobian
@@ -201,7 +201,7 @@ def refine(
         if np.abs(step).max() < 3e-5:
             break
     inside = np.abs(residual) < limit
-    scale = max(MAD * float(np.median(np.abs(residual[inside]))), LEAST_SCALE) if inside.any() else threshold
+    scale = max(MAD * float(np.median(np.abs(residual[inside]))), MIN_SCALE) if inside.any() else threshold
     weight = leverage_weights(jacobian, inside)[inside]
     covariance = sampson_covariance(residual[inside], jacobian[inside], weight, scale)
     return TwoView(R, direction, covariance, inside, scale, robust_cost(residual, threshold))

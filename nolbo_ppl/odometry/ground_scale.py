@@ -19,9 +19,9 @@ ASIDE = 2.0
 """And no further to the side than so many camera heights: walls and hedges stand there."""
 TILT = 0.01
 """Standard deviation of the ground's slope against the horizontal of the camera, rad."""
-LEAST_POINTS = 12
+MIN_POINTS = 12
 """Fewer points make no ground."""
-LEAST_PART = 0.25
+MIN_PART = 0.25
 """Nor do points that are fewer than this part of those below the horizon."""
 COARSE = 0.05
 """Relative width of the vote for the height."""
@@ -79,7 +79,7 @@ def fit_ground(
     slopes = first @ ground_axes(pitch)
     rho = depths(view.R, view.direction, first, second)[:, 0]
     below = (slopes[:, 0] > BELOW_HORIZON) & (np.abs(slopes[:, 1]) < ASIDE * slopes[:, 0]) & (rho > 0)
-    if below.sum() < LEAST_POINTS:
+    if below.sum() < MIN_POINTS:
         return None
     slopes, rho = slopes[below], rho[below]
     # An error of one corner across the focal length shifts rho by its inverse lever |R x2 x t|.
@@ -97,7 +97,7 @@ def fit_ground(
             return None
         width = np.maximum(noise, 0.02 * rho)
     used = np.abs(rho - slopes @ plane) < 3.0 * width
-    if used.sum() < max(LEAST_POINTS, LEAST_PART * len(rho)):
+    if used.sum() < max(MIN_POINTS, MIN_PART * len(rho)):
         return None
     return Ground(float(plane[0]), float(np.sqrt(np.linalg.inv(information)[0, 0])), int(used.sum()))
 

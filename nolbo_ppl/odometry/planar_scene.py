@@ -28,7 +28,7 @@ NORMAL_SCALE, TURN_SCALE, BOUND = 0.1, 0.1, 12.0
 deviations, and the most that either is held against a motion, nats."""
 DECIDED = 8.0
 """Surprise, nats, by which a twin must exceed the best motion to be forgotten."""
-LEAST_DOUBT = 0.05
+MIN_DOUBT = 0.05
 """Least probability that is left to any other twin: with it, the truth is within Mahalanobis^2 of 20 whichever it is."""
 
 
@@ -144,7 +144,7 @@ def twin_covariance(motions: Sequence[PlaneMotion], length: float) -> Float[np.n
     T = make_pose(best.view.R, length * best.view.direction)
     added = np.zeros((6, 6))
     for motion in rivals:
-        weight = max(LEAST_DOUBT, 1.0 / (1.0 + float(np.exp(motion.surprise - best.surprise))))
+        weight = max(MIN_DOUBT, 1.0 / (1.0 + float(np.exp(motion.surprise - best.surprise))))
         for R, direction in ((motion.view.R, motion.view.direction), *([motion.start] if motion.start is not None else [])):
             between = se3_log((inverse(T) @ make_pose(R, length * direction))[None])[0]
             added += weight * np.outer(between, between)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import nearest_rotation
-from nolbo_ppl.odometry.epipolar import GATE, LEAST_SCALE, student_weights
+from nolbo_ppl.odometry.epipolar import GATE, MIN_SCALE, student_weights
 
 
 def transfer_residual(
@@ -43,7 +43,7 @@ def rotation_only(
         R = align_rays(first, second, weight)
         residual = np.linalg.norm(transfer_residual(R, first, second, intrinsics), axis=1)
         # The median of a Rayleigh variable is 1.1774 standard deviations of a coordinate.
-        scale = max(float(np.median(residual)) / 1.1774, LEAST_SCALE)
+        scale = max(float(np.median(residual)) / 1.1774, MIN_SCALE)
         weight = np.where(residual < GATE * scale, student_weights(residual, scale), 0.0)
     ray = second / np.linalg.norm(second, axis=1, keepdims=True)
     focal = float(np.sqrt(intrinsics[0] * intrinsics[1]))

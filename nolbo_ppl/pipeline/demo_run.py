@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nolbo_ppl.pipeline.mapping_pipeline import run_mission
+from nolbo_ppl.pipeline.mapping_pipeline import run_pipeline
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_summary import figure_table
+from nolbo_ppl.pipeline.run_summary import score_table
 
 DEMO_SEED = 88_000
 """Seeds of the demonstration's worlds start here: neither training nor evaluation uses them."""
@@ -48,12 +48,12 @@ def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1)
     Raises:
         NolboError: the folders hold something else, or there is no such model.
     """
-    from nolbo_ppl.synthetic.worlds import drive_preset, write_drive  # brings the renderer
+    from nolbo_ppl.synthetic.worlds import sequence_preset, write_sequence_folder  # brings the renderer
 
     drive, run = out / "drive", out / "run"
-    world = drive_preset("demo", "street", DEMO_SEED + seed)
-    write_drive(world, drive, workers)
-    summary = run_mission(
+    world = sequence_preset("demo", "street", DEMO_SEED + seed)
+    write_sequence_folder(world, drive, workers)
+    summary = run_pipeline(
         RunConfig(
             images=drive / "images",
             intrinsics=drive / "intrinsics.json",
@@ -66,4 +66,4 @@ def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1)
             camera_pitch=math.radians(world.tilt),
         )
     )
-    return DemoResult(figure_table(summary), summary, drive, run)
+    return DemoResult(score_table(summary), summary, drive, run)

@@ -22,9 +22,9 @@ FRONT = 0.9
 """Mean depth of an ellipsoid's front over that central part, in half extents along the ray (1 at its very middle)."""
 FRONT_SCALE = 0.35
 """How far a real object's front may lie from there, in half extents (hollow, off-centre, or only partly seen)."""
-LEAST_PIXELS = 12
+MIN_PIXELS = 12
 """Fewer valid pixels than this say nothing."""
-LEAST_SHARE = 0.25
+MIN_SHARE = 0.25
 """Less than this share of the valid pixels near the guide's range: what is seen there is something else."""
 GATE = 4.0
 """Depths farther than this many scales from where the guide expects the front belong to something else."""
@@ -140,7 +140,7 @@ def front_depth(
         reach: half extent of the object along the ray, m: its surface spreads that far.
     """
     near = np.abs(depth - expected) <= GATE * scale + reach
-    if near.sum() < max(LEAST_PIXELS, LEAST_SHARE * len(depth)):
+    if near.sum() < max(MIN_PIXELS, MIN_SHARE * len(depth)):
         return float("nan"), near
     return float(np.median(depth[near])), near
 

@@ -8,16 +8,17 @@ import os
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.data.sequences import open_frames
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_online
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_incremental
 from nolbo_ppl.inference.slam.map_files import library_versions, write_result
 from nolbo_ppl.io.files import read_json
 from nolbo_ppl.io.run_folder import RunFolder
@@ -26,7 +27,7 @@ from nolbo_ppl.pipeline.depth_refinement import DepthScale
 from nolbo_ppl.pipeline.map_mesh import build_scene, write_glb
 from nolbo_ppl.pipeline.noise_file import write_noise
 from nolbo_ppl.pipeline.perception import (
-    DepthPictures,
+    DepthImages,
     DepthSource,
     SequenceDepth,
     StereoPairs,
@@ -34,11 +35,11 @@ from nolbo_ppl.pipeline.perception import (
     observe_sequence,
 )
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_inputs import RunInputs, estimate_or_read, keyframe_rows, open_drive
+from nolbo_ppl.pipeline.run_inputs import RunInputs, estimate_or_read, keyframe_rows, open_run_inputs
 from nolbo_ppl.pipeline.run_summary import summarise
 from nolbo_ppl.pipeline.stage_keys import STAGES, StageName, json_of, stage_settings
 from nolbo_ppl.pipeline.stage_store import PipelineStage, run_stages
-from nolbo_ppl.pipeline.thumbnails import best_views, write_crops
+from nolbo_ppl.pipeline.thumbnails import best_views, write_thumbnails
 from nolbo_ppl.viz.map_plots import draw_slam_result
 
 LOG = logging.getLogger(__name__)
@@ -57,7 +58,7 @@ class ObjectMappingPipeline:
     def __init__(self, config: RunConfig) -> None:
         self.config, self.out, self.run = config, config.out, RunFolder(config.out)
         check_folders(config)
-        self.drive: RunInputs = open_drive(config)
+        self.drive: RunInputs = open_run_inputs(config)
         self.seconds: dict[str, float] = {}
         self.cpu_seconds: dict[str, float] = {}
 
@@ -93,7 +94,7 @@ class ObjectMappingPipeline:
         used = self.drive.used[rows]
         self.run.write_camera(self.drive.camera)
         if self.drive.truth is not None:
-            self.run.write_truth(self.drive.truth[used])
+            self.run.write_ground_truth(self.drive.truth[used])
         self.run.write_odometry(*found.at(rows))
         self.run.write_frames(
             [
@@ -106,7 +107,7 @@ class ObjectMappingPipeline:
         """Depth of the keyframes, where there is any."""
         config, index = self.config, self.run.keyframes.tolist()
         if config.depth is not None:
-            return DepthPictures(beside(config.depth, self.run.image_names, index), DepthScale(config.depth_unit))
+            return DepthImages(beside(config.depth, self.run.image_names, index), DepthScale(config.depth_unit))
         if config.right is not None and config.baseline is not None:
             right = open_frames(config.right)
             return StereoPairs(lambda k: right.frame(index[k]), float(self.drive.intrinsics[0]), config.baseline)
@@ -132,7 +133,7 @@ class ObjectMappingPipeline:
     def slam(self) -> None:
         """EM: trajectory, landmarks, associations, decoded shapes, where every iteration stood."""
         config, problem = self.config, self.problem
-        result: SlamResult = (solve_online if config.online else solve)(problem, self.slam_config)
+        result: SlamResult = (solve_incremental if config.online else solve)(problem, self.slam_config)
         for text in result.state.noise.warnings:
             LOG.warning("%s", text)
         write_noise(self.run.slam / "noise.npz", result.state.noise)
@@ -149,7 +150,7 @@ class ObjectMappingPipeline:
         """The best picture of each landmark."""
         seen, found = self.run.detections, self.run.associations
         assert seen is not None and found is not None
-        write_crops(self.run.crops, best_views(seen, found, [landmark.name for landmark in self.run.landmarks]), self.read)
+        write_thumbnails(self.run.crops, best_views(seen, found, [landmark.name for landmark in self.run.landmarks]), self.read)
 
     def figures(self) -> None:
         """summary.json, and whose each observation is where the truth tells."""
@@ -194,7 +195,7 @@ class ObjectMappingPipeline:
         return [PipelineStage(name, work[name][0], settings[name], work[name][1]) for name in wanted]
 
 
-def run_mission(config: RunConfig) -> dict[str, Any]:
+def run_pipeline(config: RunConfig) -> dict[str, Any]:
     """Run what is not there yet; returns `summary.json`.
 
     Raises:
@@ -243,3 +244,7 @@ def check_folders(config: RunConfig) -> None:
                 got=f"--out {config.out}",
                 expected=f"another folder than that of --{name}",
             )
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

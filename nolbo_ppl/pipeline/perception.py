@@ -33,7 +33,7 @@ class DepthSource(Protocol):
         """Depth of a keyframe's image along the optical axis, m, NaN unknown; None when there is none."""
 
 
-class DepthPictures:
+class DepthImages:
     """Depth from a folder of 16 bit pictures.
 
     Args:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.data.sequences import (
     CameraIntrinsics,
     FrameSequence,
@@ -108,7 +109,7 @@ class FoundOdometry:
         return chosen.T_world_camera, chosen.covariance if self.stated else None
 
 
-def open_drive(config: RunConfig) -> RunInputs:
+def open_run_inputs(config: RunConfig) -> RunInputs:
     """Open images, camera and truth.
 
     Raises:
@@ -141,7 +142,7 @@ def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
     if config.camera_height is not None:
         return GroundHeight(config.camera_height, pitch=config.camera_pitch)
     if config.wheel is not None:
-        return KnownLengths(lengths_between(wheel_lengths(config.wheel, len(drive.frames) - 1), drive.used))
+        return KnownLengths(lengths_between(read_step_lengths(config.wheel, len(drive.frames) - 1), drive.used))
     if drive.truth is not None:
         if not np.isfinite(drive.truth[drive.used]).all():
             raise input_error("lengths from a truth with gaps", expected="a pose for every image, --wheel or --camera-height")
@@ -153,7 +154,7 @@ def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
     )
 
 
-def wheel_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
+def read_step_lengths(path: Path, count: int) -> Float[np.ndarray, " n"]:
     """Lengths of the steps between successive images, m. Raises `InputError` when there are more or fewer of them."""
     lengths = read_lengths(path)
     if len(lengths) != count:
@@ -199,3 +200,7 @@ def keyframe_rows(found: FoundOdometry, config: RunConfig) -> Int[np.ndarray, " 
         return np.arange(len(found.odometry))
     distance, angle = (value or np.inf for value in (config.keyframe_distance, config.keyframe_angle))
     return keyframes(found.odometry, distance, angle)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -11,18 +11,24 @@ from jaxtyping import Int
 
 from nolbo_ppl.evaluation.sequence_scores import (
     ShapeModel,
-    coverage_figures,
-    detection_figures,
+    coverage_scores,
+    detection_scores,
     finite,
     landmark_errors,
-    loop_figures,
-    map_figures,
-    matched_truth,
-    owners,
-    position_figures,
-    shape_figures,
+    landmark_to_object,
+    loop_scores,
+    map_scores,
+    matched_ground_truth,
+    position_scores,
+    shape_scores,
 )
-from nolbo_ppl.evaluation.sequence_truth import DriveTruth, MatchResult, match_detections, object_shown, read_truth
+from nolbo_ppl.evaluation.sequence_truth import (
+    MatchResult,
+    SequenceGroundTruth,
+    match_detections,
+    object_shown,
+    read_ground_truth,
+)
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import path_length, trajectory_errors
@@ -33,7 +39,7 @@ ASSOCIATION_IOU = 0.3
 """Overlap from which a detection is held to be of an object where its association is judged: loose boxes are no wrong loops."""
 
 
-def trajectory_figures(run: RunFolder) -> dict[str, Any]:
+def trajectory_scores(run: RunFolder) -> dict[str, Any]:
     """Errors before and after, as the EM has stated them, and their ratio; empty without a true trajectory."""
     errors = run.trajectory_errors
     if run.truth_given is None or "before" not in errors:
@@ -43,7 +49,9 @@ def trajectory_figures(run: RunFolder) -> dict[str, Any]:
     return {"path_length": length, **errors, "after_over_before": finite(after / before) if before > 0 else None}
 
 
-def oracle_figures(run: RunFolder, problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig) -> dict[str, Any]:
+def ground_truth_association_scores(
+    run: RunFolder, problem: SlamProblem, object_of: Int[np.ndarray, " k"], config: SlamConfig
+) -> dict[str, Any]:
     """Errors of the same detections under the same noise, associated by the truth: what is left to the association."""
     assert run.truth_given is not None
     state = solve_with_associations(problem, object_of, config, read_noise(run.slam / "noise.npz"))
@@ -51,21 +59,23 @@ def oracle_figures(run: RunFolder, problem: SlamProblem, object_of: Int[np.ndarr
     return {"oracle": oracle, "after_over_oracle": finite(after / oracle["ate"]) if oracle["ate"] > 0 else None}
 
 
-def observation_figures(table: Detections, matched: MatchResult, truth: DriveTruth, model: ShapeModel | None) -> dict[str, Any]:
+def observation_scores(
+    table: Detections, matched: MatchResult, truth: SequenceGroundTruth, model: ShapeModel | None
+) -> dict[str, Any]:
     """Detections, positions and regions against the truth."""
-    true = matched_truth(matched, table.frame, truth)["position"]
+    true = matched_ground_truth(matched, table.frame, truth)["position"]
     true[~matched.counted] = np.nan
     return {
-        **detection_figures(matched, table, truth),
-        "position_error": position_figures(table.position, true),
-        "coverage90": coverage_figures(matched, table, truth, model),
+        **detection_scores(matched, table, truth),
+        "position_error": position_scores(table.position, true),
+        "coverage90": coverage_scores(matched, table, truth, model),
     }
 
 
-def truth_figures(
+def ground_truth_scores(
     run: RunFolder,
     problem: SlamProblem,
-    truth: DriveTruth,
+    truth: SequenceGroundTruth,
     loosely: Int[np.ndarray, " k"],
     model: ShapeModel | None,
     config: SlamConfig,
@@ -76,27 +86,27 @@ def truth_figures(
     table, found = problem.observations, run.associations
     assert found is not None
     matched = match_detections(table.frame, table.box, table.objectness, truth)
-    owner, purity = owners(loosely, found.landmark_of, len(run.landmarks))
+    owner, purity = landmark_to_object(loosely, found.landmark_of, len(run.landmarks))
     exists = np.array([landmark.in_map for landmark in run.landmarks], dtype=bool)
     out: dict[str, Any] = {
-        "observation_figures": observation_figures(table, matched, truth, model),
-        "loops": loop_figures(table.frame, loosely, found.landmark_of, loop_gap),
-        "map": map_figures(loosely, owner, purity, exists, truth, config.track_minimum),
+        "observation_scores": observation_scores(table, matched, truth, model),
+        "loops": loop_scores(table.frame, loosely, found.landmark_of, loop_gap),
+        "map": map_scores(loosely, owner, purity, exists, truth, config.track_minimum),
     }
     if run.truth_given is not None:
         static = np.where((loosely >= 0) & truth.moving[loosely], -1, loosely)
-        out |= oracle_figures(run, problem, static, config)
+        out |= ground_truth_association_scores(run, problem, static, config)
         position = np.array([landmark.position for landmark in run.landmarks]).reshape(-1, 3)
         # Poses of objects are in the world of the drive, that of its true trajectory.
         error = landmark_errors(position, owner, truth, run.estimate, run.truth_given)
         error = error[exists & np.isfinite(error)]
         out["map"]["median_position_error"] = finite(np.median(error)) if len(error) else None
     if model is not None:
-        out["shape"] = shape_figures(table, found.landmark_of, owner, truth, model, rng)
+        out["shape"] = shape_scores(table, found.landmark_of, owner, truth, model, rng)
     return out
 
 
-def time_figures(seconds: Mapping[str, float], cpu_seconds: Mapping[str, float], keyframes: int) -> dict[str, Any]:
+def time_scores(seconds: Mapping[str, float], cpu_seconds: Mapping[str, float], keyframes: int) -> dict[str, Any]:
     """Seconds by stage, by the clock and of the processor; images a second through the guide, share of the EM.
 
     The share is one of processor time: it does not depend on what else the machine does.
@@ -141,19 +151,19 @@ def summarise(
         "observations": len(table),
         "landmarks": sum(landmark.in_map for landmark in run.landmarks),
         "loop_pairs": run.slam_summary.get("loop_pairs"),
-        **trajectory_figures(run),
+        **trajectory_scores(run),
     }
     objects = None
     if drive is not None:
-        truth = read_truth(drive, run.image_names)
+        truth = read_ground_truth(drive, run.image_names)
         loosely = object_shown(table.frame, table.box, truth, ASSOCIATION_IOU)
         objects = {name: truth.names[i] if i >= 0 else None for name, i in zip(table.id, loosely.tolist())}
-        out |= truth_figures(run, problem, truth, loosely, model, config, loop_gap, np.random.default_rng([seed, 3]))
-    out |= time_figures(seconds, cpu_seconds, len(run))
+        out |= ground_truth_scores(run, problem, truth, loosely, model, config, loop_gap, np.random.default_rng([seed, 3]))
+    out |= time_scores(seconds, cpu_seconds, len(run))
     return {**out, "warnings": run.slam_summary.get("warnings", [])}, objects
 
 
-def figure_table(summary: Mapping[str, Any]) -> str:
+def score_table(summary: Mapping[str, Any]) -> str:
     """The figures as lines for a terminal."""
     rows: list[tuple[str, str]] = [
         ("keyframes, observations, landmarks", f"{summary['frames']}, {summary['observations']}, {summary['landmarks']}"),
@@ -174,8 +184,8 @@ def figure_table(summary: Mapping[str, Any]) -> str:
         chart = summary["map"]
         rows.append(("landmarks / objects detected", f"{chart['landmarks']} / {chart['objects_detected']}"))
         rows.append(("  mapped, duplicates, spurious", f"{chart['objects_mapped']}, {chart['duplicates']}, {chart['spurious']}"))
-    if "observation_figures" in summary:
-        seen = summary["observation_figures"]
+    if "observation_scores" in summary:
+        seen = summary["observation_scores"]
         rows.append(("detections: recall / precision", f"{number(seen['recall'])} / {number(seen['precision'])}"))
         rows.append(("  right category", number(seen["category_accuracy"])))
         for name, band in seen["position_error"].items():

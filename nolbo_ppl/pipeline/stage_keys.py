@@ -49,7 +49,7 @@ def stage_settings(config: Any, images: Callable[[], Any]) -> dict[StageName, di
         "folder": folder_digest,
         "images": lambda _: images(),
         "model": model_digest,
-        "drive": drive_digest,
+        "drive": ground_truth_digest,
     }
     settings: dict[StageName, dict[str, Any]] = {stage: {} for stage in STAGES}
     for option in dataclasses.fields(config):
@@ -97,6 +97,6 @@ def model_digest(name: str) -> Any:
     return [name, *(() if folder is None else (file_digest(folder / file) for file in ("config.json", "model.safetensors")))]
 
 
-def drive_digest(drive: Path | None) -> Any:
+def ground_truth_digest(drive: Path | None) -> Any:
     """What tells the truth of one drive from another."""
     return None if drive is None else [str(drive), file_digest(drive / "objects.json"), file_digest(drive / "scenes.jsonl")]

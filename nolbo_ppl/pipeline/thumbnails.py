@@ -62,7 +62,7 @@ def cut(image: UInt8[np.ndarray, "h w 3"], box: Float[np.ndarray, " 4"]) -> UInt
     return np.asarray(part.resize((new[0], new[1]), Image.Resampling.LANCZOS))
 
 
-def write_crops(out: Path, views: Mapping[str, Crop], read: Callable[[int], UInt8[np.ndarray, "h w 3"]]) -> None:
+def write_thumbnails(out: Path, views: Mapping[str, Crop], read: Callable[[int], UInt8[np.ndarray, "h w 3"]]) -> None:
     """Write `NAME.png` of every view into `out`; each image is read once.
 
     Args:

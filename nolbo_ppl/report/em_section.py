@@ -9,7 +9,7 @@ import numpy as np
 
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
-from nolbo_ppl.report.report_plots import above, axis_label, near, way_lines
+from nolbo_ppl.report.report_plots import above, axis_label, near, path_lines
 from nolbo_ppl.report.svg import Axes, element, equal_axes, escape, number, picture, text
 from nolbo_ppl.report.wording import say, table
 
@@ -20,8 +20,8 @@ NAMES = {
     "phase": "Phase",
     "log_evidence": "Log evidence, nats",
     "closings": "Loops closed",
-    "links": "Links",
-    "strong_links": "Links above one half",
+    "links": "LandmarkEqualities",
+    "strong_links": "LandmarkEqualities above one half",
     "change": "Cameras moved, m (RMS)",
 }
 """Columns of the table of iterations."""
@@ -79,7 +79,7 @@ def em_slider(run: RunFolder) -> str:
     first = axes.line(every[0], class_="line odometry faint")
     plot = picture(
         axes,
-        [axes.frame(axis_label(run, 0), axis_label(run, 1)), first, way_lines(run, axes, ("truth",)), moving],
+        [axes.frame(axis_label(run, 0), axis_label(run, 1)), first, path_lines(run, axes, ("truth",)), moving],
         "Trajectory and landmarks at an iteration of EM",
     )
     last = len(iterations) - 1

@@ -77,7 +77,7 @@ def _ends(axes: Axes, xy: Float[np.ndarray, "n 2"]) -> str:
     return start + end
 
 
-def way_lines(run: RunFolder, axes: Axes, names: Sequence[str]) -> str:
+def path_lines(run: RunFolder, axes: Axes, names: Sequence[str]) -> str:
     """Some trajectories as layers."""
     found = ways(run)
     return "".join(
@@ -93,7 +93,7 @@ def trajectory_plot(run: RunFolder) -> str:
     xy = above(run, run.estimate[:, :3, 3])
     parts = [
         axes.frame(axis_label(run, 0), axis_label(run, 1)),
-        way_lines(run, axes, [name for name, _ in LINES]),
+        path_lines(run, axes, [name for name, _ in LINES]),
         _ends(axes, xy),
     ]
     return picture(axes, parts, "Trajectories from above")
@@ -156,7 +156,7 @@ def map_plot(run: RunFolder) -> str:
     axes = map_axes(run)
     parts = [
         axes.frame(axis_label(run, 0), axis_label(run, 1)),
-        way_lines(run, axes, ("truth", "estimate")),
+        path_lines(run, axes, ("truth", "estimate")),
         landmark_marks(run, axes),
     ]
     return picture(axes, parts, "Map from above")
@@ -178,7 +178,7 @@ def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
         tip += f"\n{kind}" if kind else ""
         parts.append(group([axes.line(corner, class_=f"loop {kind}", style=style, data_tip=tip)], data_layer=kind or "loops"))
     frame = axes.frame(axis_label(run, 0), axis_label(run, 1))
-    drawn = [frame, way_lines(run, axes, ("estimate",)), axes.clip(parts), landmark_marks(run, axes, ellipses=False)]
+    drawn = [frame, path_lines(run, axes, ("estimate",)), axes.clip(parts), landmark_marks(run, axes, ellipses=False)]
     return picture(axes, drawn, "Loop closures")
 
 

@@ -23,7 +23,7 @@ from nolbo_ppl.report.report_plots import (
 )
 from nolbo_ppl.report.svg import element, escape
 from nolbo_ppl.report.weight_heatmap import heat_map
-from nolbo_ppl.report.wording import figures_tables, say, settings_table
+from nolbo_ppl.report.wording import say, score_tables, settings_table
 from nolbo_ppl.viz.style import MUTED, category_colour
 
 OPTIONS = ("images", "intrinsics", "odometry", "wheel", "truth", "truth_objects", "depth", "right", "model", "out")
@@ -100,7 +100,7 @@ def world_map(run: RunFolder) -> str:
 
 
 def loop_closures(run: RunFolder) -> str:
-    """Links of loops and how many of them are right."""
+    """LandmarkEqualities of loops and how many of them are right."""
     if run.associations_in_time is None or not run.landmarks:
         return ""
     if run.associations_in_time.frame is None:
@@ -162,7 +162,7 @@ def figures(run: RunFolder) -> str:
     """Every number of the summaries."""
     parts = ""
     for source, values in (("", run.summary), ("SLAM: " if run.summary else "", run.slam_summary)):
-        for title, rows in figures_tables(values):
+        for title, rows in score_tables(values):
             parts += element("div", element("h3", escape(source + title)) + rows, class_="block")
     return element("div", parts, class_="blocks") if parts else ""
 

@@ -31,7 +31,7 @@ TITLES = {
     "map": "Map against the truth",
     "loops": "Loop pairs",
     "shape": "Shapes",
-    "observation_figures": "Observations against the truth",
+    "observation_scores": "Observations against the truth",
 }
 """Parts of a summary whose name alone would not say what they are."""
 SETTINGS = ("configuration", "versions", "iterations", "warnings", "noise", "fingerprints", "complete")
@@ -88,7 +88,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], class_: str = "") 
     return element("div", element("table", header + element("tbody", body), class_=class_ or None), class_="scroll")
 
 
-def figures_tables(values: Mapping[str, Any], title: str = "Counts") -> list[tuple[str, str]]:
+def score_tables(values: Mapping[str, Any], title: str = "Counts") -> list[tuple[str, str]]:
     """Figures of a summary: a titled table for each nested object, the plain ones first.
 
     Objects whose members are objects become one table with the members as columns, and so do the errors before and after.
@@ -107,7 +107,7 @@ def figures_tables(values: Mapping[str, Any], title: str = "Counts") -> list[tup
         if len(value) > 1 and all(isinstance(member, Mapping) for member in value.values()):
             out.append((name, _columns(value)))
         else:
-            out += figures_tables(value, name)
+            out += score_tables(value, name)
     return out
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -210,9 +211,15 @@ class ObjectPosteriors:
             azimuth_concentration=significant(self.viewpoint_modes.concentration),
         )
 
-    def rows(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
+    def to_records(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
         """One JSON-able dictionary an object, the lines of `observations.jsonl`."""
         return to_records(self.detections(frame, image))
 
+    def rows(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
+        """`to_records` under its name of 0.1.0."""
+        warnings.warn("ObjectPosteriors.rows is now to_records; the old name goes with 0.3.0", FutureWarning, stacklevel=2)
+        return self.to_records(frame, image)
 
-__getattr__ = renamed(__name__, {"Observations": "ObjectPosteriors"})
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

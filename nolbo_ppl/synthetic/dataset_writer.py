@@ -17,8 +17,8 @@ from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.scenes.scene_records import record_of
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 
 CHUNK = 128
 """Scenes that one job renders."""
@@ -26,7 +26,7 @@ SCENES = "scenes.jsonl"
 """Written last: a folder that has it is complete."""
 
 
-def _write_chunk(source: SceneSource, out: Path, first: int, last: int) -> int:
+def _write_chunk(source: SceneGenerator, out: Path, first: int, last: int) -> int:
     """Images of scenes `first` to `last`, then their lines and voxels, which mark the chunk as done."""
     rows: list[dict[str, Any]] = []
     voxels: dict[str, np.ndarray] = {}
@@ -44,7 +44,7 @@ def _write_chunk(source: SceneSource, out: Path, first: int, last: int) -> int:
     return last - first
 
 
-def write_scenes(out: str | os.PathLike[str], source: SceneSource, count: int, workers: int = 1) -> dict[str, Any]:
+def write_scenes(out: str | os.PathLike[str], source: SceneGenerator, count: int, workers: int = 1) -> dict[str, Any]:
     """Write the first `count` scenes of a source; a run that was killed is resumed by calling it again.
 
     Args:
@@ -67,7 +67,7 @@ def write_scenes(out: str | os.PathLike[str], source: SceneSource, count: int, w
         return _write(out, source, count, workers)
 
 
-def _write(out: Path, source: SceneSource, count: int, workers: int) -> dict[str, Any]:
+def _write(out: Path, source: SceneGenerator, count: int, workers: int) -> dict[str, Any]:
     description = {"count": count, **source.describe()}
     made = out / "source.json"
     if made.is_file():
@@ -97,7 +97,7 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _render_missing(out: Path, source: SceneSource, count: int, workers: int) -> None:
+def _render_missing(out: Path, source: SceneGenerator, count: int, workers: int) -> None:
     (out / "images").mkdir(parents=True, exist_ok=True)
     chunks = [(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
     missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]

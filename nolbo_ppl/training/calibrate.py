@@ -14,14 +14,14 @@ from torch import Tensor
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import wrap_angle
-from nolbo_ppl.inference.posterior.decode import box_scales, position_covariance
+from nolbo_ppl.inference.posterior.decode import box_sigmas, position_covariance
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, decode_box, decode_range
 
-LEAST_OBJECTS = 50
+MIN_OBJECTS = 50
 """Fewer held-out objects than this fix no factor."""
 
 
@@ -97,7 +97,7 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
 
     for batch in batches:
         scene = model.guide.observe(batch)
-        where, q = scene.assignment, scene.posterior.at_mode(model.story.prior.label_mean())
+        where, q = scene.assignment, scene.posterior.at_map_category(model.story.prior.label_mean())
         known = torch.ones_like(where.is_object) if where.counted is None else where.counted
         add("logit", scene.encoding.objectness_logit[known])
         add("is_object", where.is_object[known])
@@ -134,7 +134,7 @@ def _positions(
     at = q.map(lambda value: value[mask])
     camera = batch.intrinsics[:, None].expand(-1, mask.shape[1], -1)[mask]
     box = decode_box(at.box_loc, cell, columns, config)
-    box_scale = box_scales(at, config)
+    box_scale = box_sigmas(at, config)
     position, _ = decode_range(at.range_loc, box, camera, config)
     still = dataclasses.replace(at, range_scale=torch.zeros_like(at.range_scale))
     return {
@@ -157,13 +157,13 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
     Gaussian heads by their 90 % regions: the range's by that of the position, which is what answers state.
 
     Raises:
-        TooFewObjects: the scenes hold fewer than `LEAST_OBJECTS` objects.
+        TooFewObjects: the scenes hold fewer than `MIN_OBJECTS` objects.
     """
     model.eval()
     found = _collect(model, batches)
     count = len(found.get("box", ()))
-    if count < LEAST_OBJECTS:
-        raise TooFewObjects(f"too few objects to calibrate on: got {count}, expected at least {LEAST_OBJECTS}")
+    if count < MIN_OBJECTS:
+        raise TooFewObjects(f"too few objects to calibrate on: got {count}, expected at least {MIN_OBJECTS}")
 
     def objectness(x: Tensor) -> Tensor:
         odds = x[0].exp() * found["logit"] + x[1]

@@ -28,7 +28,7 @@ from nolbo_ppl.models.shape_networks import bounded_exp
 
 CANDIDATES = 48
 """Regions of an image that are learnt from: those with the most evidence, and those of its objects."""
-LEAST_BACKGROUND = 5
+MIN_BACKGROUND = 5
 """Photographs of which fewer regions are known to be background say nothing of how often the detector is wrong."""
 SMOOTH = 0.01
 """Objects are certain up to this: boxes are wrong now and then."""
@@ -290,7 +290,7 @@ def _fit_domain(fusion: Fusion, context: Float[Tensor, "n c"], generated: Bool[T
 def _fit_photographs(fusion: Fusion, table: EvidenceTable, steps: int = 200) -> None:
     """Factor and shift of the detector's log odds, and weights of its and the second look's log probabilities: four numbers."""
     labels = table.look.shape[-1]
-    background = (table.known & ~table.is_object).sum(1) >= LEAST_BACKGROUND
+    background = (table.known & ~table.is_object).sum(1) >= MIN_BACKGROUND
     strong = table.known & (table.detector.log_odds > WEAK) & background[:, None]
     odds, target = table.detector.log_odds[strong], table.is_object[strong].to(table.context.dtype)
     found = table.category >= 0

@@ -21,9 +21,9 @@ from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
-from nolbo_ppl.training.scene_supply import JoinedScenes, MixedSupply, SceneSubset, SceneSupply, ShapeTable
+from nolbo_ppl.training.scene_loader import ConcatScenes, MixedSceneLoader, SceneLoader, SceneSubset, ShapeTable
 from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
 from nolbo_ppl.training.train_config import TrainConfig
 
@@ -32,7 +32,7 @@ VALIDATION_SEED = 1000
 
 HELD_OUT_EVERY = 10
 """One scene of so many of each data set of a mix is held out."""
-LEAST_HELD_OUT = 512
+MIN_HELD_OUT = 512
 """Least number of generated held-out scenes."""
 
 
@@ -59,12 +59,12 @@ class TrainingData:
         if len(self.table) == 0 and config.shape_steps:
             raise input_error("no shapes to learn", got=config.scenes, do="add voxels.npz, or use --shape-steps 0")
 
-    def _sources(self, seed: int) -> list[SceneSource | ViewSource]:
+    def _sources(self, seed: int) -> list[SceneGenerator | ViewSource]:
         """Where generated scenes come from: a source for each kind of scene and each size."""
         config = self.config
         mixed = config.difficulty == "mixed"
         photographs = None if config.backgrounds is None else str(config.backgrounds)
-        sources: list[SceneSource | ViewSource] = []
+        sources: list[SceneGenerator | ViewSource] = []
         sizes = config.render_sizes or (rendered_size(self.model.image_size),)
         for size in sizes:
             for kind in ("standard", "full") if mixed else (config.difficulty,):
@@ -72,15 +72,15 @@ class TrainingData:
                 if mixed and kind == "full":  # CAD without materials, and photographs, look like no other generated scene
                     base = dataclasses.replace(base, single_material=0.25, photographs=0.85)
                 behind = None if mixed and kind == "standard" else photographs
-                sources.append(SceneSource(base, seed, backgrounds=behind))
+                sources.append(SceneGenerator(base, seed, backgrounds=behind))
         if mixed:
             sources.append(ViewSource(ViewConfig(min(sizes)), seed))
         return sources
 
-    def _cached(self, sources: Sequence[SceneSource | ViewSource], count: int) -> JoinedScenes:
+    def _cached(self, sources: Sequence[SceneGenerator | ViewSource], count: int) -> ConcatScenes:
         """Scenes of some sources, as many of each; the first process renders what is missing."""
         root = self.config.cache.expanduser() / "scenes"
-        return JoinedScenes([write_cache(root, one, -(-count // len(sources)), self.config.workers) for one in sources])
+        return ConcatScenes([write_cache(root, one, -(-count // len(sources)), self.config.workers) for one in sources])
 
     def _generate(self) -> None:
         """Generated scenes, and held-out ones of another seed."""
@@ -88,7 +88,7 @@ class TrainingData:
         if self.world > 1 and self.rank > 0:
             distributed.barrier()
         train = self._cached(self._sources(config.seed), config.count)
-        held_out = self._cached(self._sources(config.seed + VALIDATION_SEED), max(LEAST_HELD_OUT, config.evaluate_scenes))
+        held_out = self._cached(self._sources(config.seed + VALIDATION_SEED), max(MIN_HELD_OUT, config.evaluate_scenes))
         self.train, self._held_out = train, held_out
         self.single = self.train
         if config.single_steps:
@@ -96,7 +96,7 @@ class TrainingData:
             assert isinstance(base, SceneConfig)  # views of worlds come last
             single = dataclasses.replace(base, objects=(1, 1), clutter=(0, 1), object_pixels=(40.0, 0.9))
             behind = None if config.difficulty == "mixed" or config.backgrounds is None else str(config.backgrounds)
-            source = SceneSource(single, config.seed, backgrounds=behind)
+            source = SceneGenerator(single, config.seed, backgrounds=behind)
             self.single = self._cached([source], config.single_count)
         if self.world > 1 and self.rank == 0:
             distributed.barrier()
@@ -105,7 +105,7 @@ class TrainingData:
     def _open_mix(self) -> None:
         """Folders and generated scenes in fixed shares; every tenth scene of each is held out."""
         config = self.config
-        parts: list[SceneFolder | JoinedScenes] = [
+        parts: list[SceneFolder | ConcatScenes] = [
             SceneFolder(path, self.model.categories, size=self.model.image_size, symmetry=self.model.symmetry)
             for path in config.scenes
         ]
@@ -163,17 +163,17 @@ class TrainingData:
             return shapes()
         seed = 3 * config.seed + (1 if stage == "single" else 2)  # one for all parts: they choose the same size
 
-        def supply_of(scenes: Scenes, table: ShapeTable, batch: int) -> SceneSupply:
-            return SceneSupply(
+        def loader_of(scenes: Scenes, table: ShapeTable, batch: int) -> SceneLoader:
+            return SceneLoader(
                 scenes, table, batch, seed, latent, self.augmentation, self.model.image_size, config.sizes,
                 len(self.model.instances), self.rank, self.world,
             )  # fmt: skip
 
-        supply: SceneSupply | MixedSupply
+        supply: SceneLoader | MixedSceneLoader
         if self._mix:
-            supply = MixedSupply([supply_of(*part) for part in self._mix])
+            supply = MixedSceneLoader([loader_of(*part) for part in self._mix])
         else:
-            supply = supply_of(self.single if stage == "single" else self.train, self.table, config.batch)
+            supply = loader_of(self.single if stage == "single" else self.train, self.table, config.batch)
 
         def scenes() -> Iterator[SceneBatch]:
             step = start
@@ -187,7 +187,7 @@ class TrainingData:
         """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""
         parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
         for scenes, table in parts:
-            supply = SceneSupply(
+            supply = SceneLoader(
                 scenes, table, 64, 0, self.model.latent_dim, size=self.model.image_size, known_instances=len(self.model.instances)
             )
             total = len(scenes) if count is None else min(-(-count // len(parts)), len(scenes))
@@ -215,19 +215,19 @@ class TrainingData:
         train = self._mix or [(self.train, self.table, 0)]
         parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
         for scenes, table in parts if held_out else [(scenes, table) for scenes, table, _ in train]:
-            supply = SceneSupply(scenes, table, 16, 0, self.model.latent_dim, size=self.model.image_size)
+            supply = SceneLoader(scenes, table, 16, 0, self.model.latent_dim, size=self.model.image_size)
             chosen = np.unique(np.linspace(0, len(scenes) - 1, min(most, len(scenes))).round().astype(int))
             for first in range(0, len(chosen), 16):
                 yield supply.prepared(chosen[first : first + 16])
 
-    def teach(self, model: Nolbo) -> None:
+    def encode_shapes(self, model: Nolbo) -> None:
         """Encode the shapes by the trained shape guide, in full precision."""
         model.set_half_precision(False)
         mirrored = self.augmentation is not None and self.augmentation.mirror_probability > 0
         for table in [table for _, table, _ in self._mix] or [self.table]:
-            table.teach(model, mirrored=mirrored)
+            table.encode_shapes(model, mirrored=mirrored)
         if self._held_out_table is not self.table:
-            self._held_out_table.teach(model)
+            self._held_out_table.encode_shapes(model)
 
 
 def shares(mix: Sequence[float], batch: int) -> list[int]:

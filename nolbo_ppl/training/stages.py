@@ -12,7 +12,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, ElboResult, SceneELBO, SceneLoss
-from nolbo_ppl.inference.svi import OptimisationConfig, OptimisationState
+from nolbo_ppl.inference.svi import OptimizerConfig, OptimizerState
 from nolbo_ppl.models.normalisation import set_joint
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
@@ -31,7 +31,7 @@ class TrainingStage:
 
     name: str
     """`shapes`, `single` or `scenes`."""
-    optimisation: OptimisationConfig
+    optimisation: OptimizerConfig
     """Optimiser and schedule."""
     weights: Mapping[str, float]
     """Weights of the terms of the loss."""
@@ -46,7 +46,7 @@ class ShapeLoss(nn.Module):
 
     def __init__(self, model: Nolbo, elbo: SceneELBO) -> None:
         super().__init__()
-        self.story, self.guide, self.elbo = model.shape_story, model.shape_guide, elbo
+        self.story, self.guide, self.elbo = model.shape_model, model.shape_guide, elbo
 
     def forward(self, batch: ShapeBatch) -> ElboResult:
         """Evaluate the bound, in nats a shape."""
@@ -83,7 +83,7 @@ class StageRun:
         set_joint(model, not self._local)
         if together and not self._local:
             module = DistributedDataParallel(module, find_unused_parameters=True)
-        self.state: OptimisationState = optimisation.init(model, module, stage.optimisation)
+        self.state: OptimizerState = optimisation.init(model, module, stage.optimisation)
 
     def set_modes(self) -> bool:
         """Training and evaluation modes and frozen parts for the next step; returns whether the story is frozen."""
@@ -118,7 +118,7 @@ class StageRun:
         copy.load_state_dict(self.state.average)
         return copy.eval().requires_grad_(False)
 
-    def adopt_average(self) -> None:
+    def load_ema(self) -> None:
         """End the stage: the networks take the averaged weights."""
         self.model.load_state_dict(self.state.average)
 

@@ -14,7 +14,7 @@ from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.posterior.model_folder import load
-from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.models.model_config import PRESETS, ModelConfig
 from nolbo_ppl.training.net2net import grown_config
 from nolbo_ppl.training.stages import TrainingStage, scene_weights
@@ -284,11 +284,11 @@ class TrainConfig:
     def stages(self) -> list[TrainingStage]:
         """The stages that have steps."""
         weights = scene_weights(self.objective, self.weights)
-        images = OptimisationConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
+        images = OptimizerConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
         stages = [
             TrainingStage(
                 "shapes",
-                OptimisationConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
+                OptimizerConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
                 SHAPE_STAGE,
             ),
             TrainingStage(

@@ -34,8 +34,8 @@ from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.stage_data import TrainingData
 from nolbo_ppl.training.stages import StageRun
 from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
-from nolbo_ppl.training.training_log import Journal, run_folder
-from nolbo_ppl.training.validation import held_out
+from nolbo_ppl.training.training_log import TrainingLogger, run_folder
+from nolbo_ppl.training.validation import validate
 
 
 @dataclass
@@ -77,22 +77,22 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
         if config.grow:
             initial = grow(initial, model.config, config.seed)
         adopt(model, initial, config.detector)
-    journal = Journal(config, rank)
+    training_logger = TrainingLogger(config, rank)
     stages = config.stages()
-    first, tensors, at_step = journal.resume(model, stages)
+    first, tensors, at_step = training_logger.resume(model, stages)
     waited = busy = 0.0
     for number, stage in enumerate(stages):
         if number < first:
             continue
         if stage.name != "shapes":
-            data.teach(model)
+            data.encode_shapes(model)
         stage_run = StageRun(model, stage, config.bf16, config.average_every)
         if number == first and tensors is not None:
             optimisation.restore(stage_run.state, tensors, at_step)
-        w, b = _train_stage(stage_run, number, data, journal, config)
+        w, b = _train_stage(stage_run, number, data, training_logger, config)
         waited, busy = waited + w, busy + b
-        stage_run.adopt_average()
-        journal.checkpoint(number + 1, model)
+        stage_run.load_ema()
+        training_logger.checkpoint(number + 1, model)
     summary = TrainSummary(
         config.out / "model",
         sum(stage.optimisation.steps for stage in stages),
@@ -104,8 +104,8 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
         weighed = weigh_evidence(model, data, config) if model.config.detector else {}
         calibration = Calibration()
         if any(stage.name != "shapes" for stage in stages):
-            data.teach(model)
-            summary.held_out = held_out(model, data.validation(config.evaluate_scenes))
+            data.encode_shapes(model)
+            summary.held_out = validate(model, data.validation(config.evaluate_scenes))
             with suppress(TooFewObjects):  # a small folder of a user's own: the scales stay as they were learnt
                 calibration = calibrate(model, data.validation(None))
         summary.seconds = time.perf_counter() - started
@@ -116,7 +116,7 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
             "versions": {"nolbo_ppl": __version__, "torch": torch.__version__},
         }
         save(config.out / "model", model, calibration, meta)
-        journal.close()
+        training_logger.close()
     if world > 1:
         distributed.barrier()
         distributed.destroy_process_group()
@@ -143,13 +143,13 @@ def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dic
 
 
 def _train_stage(
-    stage_run: StageRun, number: int, data: TrainingData, journal: Journal, config: TrainConfig
+    stage_run: StageRun, number: int, data: TrainingData, training_logger: TrainingLogger, config: TrainConfig
 ) -> tuple[float, float]:
     """Make the steps of a stage; returns the seconds waited for data and those spent on everything else."""
     name, steps = stage_run.stage.name, stage_run.stage.optimisation.steps
     waited, start = 0.0, time.perf_counter()
     batches = data.batches(name, stage_run.state.step)
-    bar = progress_bar(None, name, "step", total=steps, done=stage_run.state.step, shown=not journal.rank)
+    bar = progress_bar(None, name, "step", total=steps, done=stage_run.state.step, shown=not training_logger.rank)
     with bar, batches if isinstance(batches, prefetch) else nullcontext():
         while not stage_run.finished:
             before = time.perf_counter()
@@ -160,13 +160,13 @@ def _train_stage(
             at = stage_run.state.step
             if at % config.log_every == 0 or at == steps:
                 scenes = len(batch.image) if isinstance(batch, SceneBatch) else len(batch.voxels)
-                journal.log(name, info, scenes, time.perf_counter() - start, waited)
+                training_logger.log(name, info, scenes, time.perf_counter() - start, waited)
                 bar.set_postfix(loss=f"{info.loss:.3f}")
-            if name != "shapes" and at % config.evaluate_every == 0 and at < steps and journal.rank == 0:
-                figures = held_out(stage_run.averaged(), data.validation(config.evaluate_scenes))
-                journal.write({"stage": name, "step": at, **figures})
+            if name != "shapes" and at % config.evaluate_every == 0 and at < steps and training_logger.rank == 0:
+                figures = validate(stage_run.averaged(), data.validation(config.evaluate_scenes))
+                training_logger.write({"stage": name, "step": at, **figures})
             if at % config.checkpoint_every == 0 and at < steps:
-                journal.checkpoint(number, stage_run)
+                training_logger.checkpoint(number, stage_run)
     return waited, time.perf_counter() - start - waited
 
 

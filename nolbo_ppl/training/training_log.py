@@ -6,11 +6,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.svi import StepInfo
@@ -55,7 +56,7 @@ def run_folder(folder: Path) -> Iterator[None]:
         yield
 
 
-class Journal:
+class TrainingLogger:
     """metrics.jsonl, checkpoint and configuration of a run; only the first process writes."""
 
     def __init__(self, config: TrainConfig, rank: int) -> None:
@@ -188,3 +189,7 @@ def _complete_rows(path: Path) -> list[tuple[int, dict[str, Any]]]:
         with atomic_path(path) as temporary:
             temporary.write_bytes(b"".join(line + b"\n" for line in whole))
     return list(read_jsonl(path))
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import torch
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SceneELBO
@@ -17,7 +19,7 @@ from nolbo_ppl.models.scene_batch import SceneBatch, decode_box
 
 
 @torch.no_grad()
-def held_out(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> dict[str, float]:
+def validate(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> dict[str, float]:
     """Figures of a model on held-out batches.
 
     Returns the pure bound by term (`bound/...`, nats a scene, and their sum `bound`), the inclusive terms
@@ -61,7 +63,7 @@ def _collect(model: Nolbo, scene: ObservedScene, found: dict[str, list[torch.Ten
     batch, where, config = scene.batch, scene.assignment, model.config
     mask = where.assigned & (batch.visibility >= 0.5)
     mean = model.story.prior.label_mean()
-    q = scene.posterior.map(lambda value: value[mask]).at_mode(mean)
+    q = scene.posterior.map(lambda value: value[mask]).at_map_category(mean)
     box = decode_box(q.box_loc, where.cell[mask], scene.encoding.columns, config)
     found["box50"].append(box_iou(box, batch.box[mask]) >= 0.5)
     labelled = batch.category[mask] >= 0
@@ -77,3 +79,7 @@ def _collect(model: Nolbo, scene: ObservedScene, found: dict[str, list[torch.Ten
         found["error"].append(geodesic_angle(viewpoint_to_matrix(mode), viewpoint_to_matrix(truth)))
         if config.orientation == "mixture":
             found["region"].append(posterior.azimuth.hpd_mass(truth[:, 0]) <= 0.9)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 REGION_90 = np.sqrt(4.605170185988091)
 """Radius, in standard deviations, of the 90 % region of a Gaussian in the plane: sqrt(-2 log 0.1)."""
-LEAST_DEPTH = 1e-3
+MIN_DEPTH = 1e-3
 """Points nearer than this to the camera's plane, as a share of the object's distance, are not drawn."""
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -26,7 +26,7 @@ _FRONT = [0, 1, 5, 4]
 
 def project(points: Float[np.ndarray, "n 3"], intrinsics: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "n 2"] | None:
     """Pixels of points in the camera frame; None when one of them is not before the camera."""
-    if (points[:, 2] <= LEAST_DEPTH * np.linalg.norm(points, axis=1)).any():
+    if (points[:, 2] <= MIN_DEPTH * np.linalg.norm(points, axis=1)).any():
         return None
     return points[:, :2] / points[:, 2:] * intrinsics[:2] + intrinsics[2:]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SHOWN = 4
 """Categories in the bars of the class posterior."""
-LEAST_MODE = 0.05
+MIN_MODE = 0.05
 """Azimuth modes of less weight are drawn in the density but not marked."""
 
 
@@ -68,7 +68,7 @@ def draw_azimuth(axes: Axes, observations: ObjectPosteriors, index: int, colour:
     axes.plot(*hole.T, color=MUTED, linewidth=0.6)
     modes = observations.viewpoint_modes
     for weight, mean in zip(modes.weights[index], modes.azimuth[index]):
-        if weight >= LEAST_MODE:
+        if weight >= MIN_MODE:
             x, y = inner * math.sin(mean), -inner * math.cos(mean)
             axes.plot([0, x], [0, y], color=INK, linewidth=0.4 + 2.0 * float(weight), solid_capstyle="butt")
     for text, x, y in (("front", 0, -1.19), ("back", 0, 1.19), ("90°", 1.27, 0), ("-90°", -1.27, 0)):

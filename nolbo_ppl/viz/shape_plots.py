@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
-LEAST_ELEVATION = 12.0
+MIN_ELEVATION = 12.0
 """Shapes are shown from at least this height in degrees, so that a level view still has depth."""
 LIGHT = np.array([-0.45, 0.55, 0.7])
 """Direction of the light in the view: right, up, towards the viewer."""
@@ -40,7 +40,7 @@ def shape_axes(figure: Figure, place: SubplotSpec, viewpoint: Float[np.ndarray, 
     figure.add_axes(axes)
     azimuth, elevation, in_plane = np.degrees(viewpoint)
     # Azimuth zero looks from -y, which matplotlib counts as -90 degrees.
-    axes.view_init(elev=max(elevation, LEAST_ELEVATION), azim=azimuth - 90, roll=-in_plane)
+    axes.view_init(elev=max(elevation, MIN_ELEVATION), azim=azimuth - 90, roll=-in_plane)
     axes.set_proj_type("persp", focal_length=1.6)
     axes.set(xlim=(-0.4, 0.4), ylim=(-0.4, 0.4), zlim=(-0.4, 0.4))
     axes.set_box_aspect((1, 1, 1), zoom=1.42)

@@ -19,14 +19,14 @@ from nolbo_ppl.pipeline.demo_run import DEMO_SEED
 def small(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """A drive of twelve small images; the drives asked for are listed."""
     asked: list[Any] = []
-    original = drives.drive_preset
+    original = drives.sequence_preset
 
-    def preset(name: str, world: Any, seed: int) -> drives.DriveConfig:
+    def preset(name: str, world: Any, seed: int) -> drives.SequenceConfig:
         asked.append((name, world, seed))
         config = original(name, world, seed)
         return dataclasses.replace(config, frames=12, laps=0.12, size=(192, 96), objects=12, clutter=6)
 
-    monkeypatch.setattr(drives, "drive_preset", preset)
+    monkeypatch.setattr(drives, "sequence_preset", preset)
     return asked
 
 

@@ -387,9 +387,9 @@ def test_retrieval_takes_the_latents_at_the_true_boxes():
     """An oracle that answers with the shape's own latent finds every instance; one that answers with nothing, none."""
     from nolbo_ppl.evaluation.instance_views import InstanceViews
     from nolbo_ppl.synthetic.scenes.scene_config import preset
-    from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+    from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
-    views = InstanceViews(SceneSource(dataclasses.replace(preset("easy", 64), categories=("car", "chair"))), 3, CATEGORIES)
+    views = InstanceViews(SceneGenerator(dataclasses.replace(preset("easy", 64), categories=("car", "chair"))), 3, CATEGORIES)
     truth = {view.image.tobytes(): view.voxels for instance in views.instances for view in views.pair(*instance)}
     model = Oracle([], [])
 
@@ -499,10 +499,10 @@ def test_errors():
 def scene_folder(tmp_path_factory):
     from nolbo_ppl.synthetic.dataset_writer import write_scenes
     from nolbo_ppl.synthetic.scenes.scene_config import preset
-    from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+    from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
     folder = tmp_path_factory.mktemp("scenes") / "set"
-    write_scenes(folder, SceneSource(preset("easy", 64), seed=evaluate.SEED), 6)
+    write_scenes(folder, SceneGenerator(preset("easy", 64), seed=evaluate.SEED), 6)
     return folder
 
 
@@ -510,12 +510,12 @@ def scene_folder(tmp_path_factory):
 def test_folder_and_generated_scenes_are_the_same(scene_folder):
     from nolbo_ppl.evaluation.labelled_scenes import GeneratedScenes
     from nolbo_ppl.synthetic.scenes.scene_config import preset
-    from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+    from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
     model_config = dataclasses.replace(tiny(), image_size=64)
     read = open_scenes(config(scenes=scene_folder, count=5), model_config)
     assert isinstance(read, FolderScenes) and len(read) == 5
-    generated = GeneratedScenes(SceneSource(preset("easy", 64), seed=evaluate.SEED), 5)
+    generated = GeneratedScenes(SceneGenerator(preset("easy", 64), seed=evaluate.SEED), 5)
     for index in range(5):
         a, b = read[index], generated[index]
         for name in (*ARRAYS, "intrinsics", "ignore", "voxels", "pixels"):

@@ -8,13 +8,13 @@ import importlib
 import pytest
 
 OPTIONS = {
-    "cli.curves:CurvesArguments": """
+    "cli.curves:CurvesConfig": """
         out runs
     """,
     "cli.demo:DemoConfig": """
         model out seed workers
     """,
-    "cli.drive:DriveOptions": """
+    "cli.drive:DriveConfig": """
         camera_height clutter focal frames laps look_alikes moving noise objects opposite out preset seed size step
         supersample tilt workers world
     """,
@@ -25,14 +25,14 @@ OPTIONS = {
     "cli.observe:ObserveConfig": """
         batch images intrinsics model out pictures seed size threshold
     """,
-    "cli.odometry:OdometryArguments": """
+    "cli.odometry:OdometryRunConfig": """
         camera_height camera_pitch config count first images intrinsics lengths out scale truth
     """,
     "odometry:OdometryConfig": """
         cell confidence detector fast_threshold features inflation iterations largest_shift least_inliers level_factor
         levels lost_rotation_scale lost_translation_ratio parallax_share patch ratio seed still_shift threshold
     """,
-    "cli.report:ReportArguments": """
+    "cli.report:ReportConfig": """
         observations odometry out run_dir title truth
     """,
     "pipeline.run_config:RunConfig": """
@@ -49,7 +49,7 @@ OPTIONS = {
     "cli.scenes:ScenesConfig": """
         backgrounds cad count difficulty instances out seed size workers
     """,
-    "cli.slam:SlamArguments": """
+    "cli.slam:SlamRunConfig": """
         config model observations odometry odometry_covariance online out truth
     """,
     "inference.slam:SlamConfig": """
@@ -65,7 +65,7 @@ OPTIONS = {
         mirror objective optimizer orientation out preset resume scene_steps scenes seed shape_batch shape_steps
         single_count single_steps sizes symmetry tensorboard threads validation weights workers
     """,
-    "cli.view:ViewArguments": """
+    "cli.view:ViewerConfig": """
         browser host odometry port run_dir truth
     """,
 }

@@ -92,7 +92,7 @@ def test_every_file_is_written_and_the_loop_is_closed(known: SimulatedDrive, fin
     chart = summary["map"]
     assert chart["landmarks"] == summary["landmarks"] and chart["objects_mapped"] >= 0.8 * chart["objects_detected"]
     assert chart["duplicates"] <= 2 and chart["median_position_error"] < 0.5
-    seen = summary["observation_figures"]
+    seen = summary["observation_scores"]
     assert seen["recall"] > 0.6 and seen["precision"] > 0.8 and seen["category_accuracy"] > 0.95
     assert seen["coverage90"]["orientation"] > 0.8
     views = list(summary["shape"]["iou"].values())
@@ -146,18 +146,18 @@ def test_an_interruption_keeps_what_is_complete(known: SimulatedDrive, tmp_path:
     out = tmp_path / "run"
     short = replace(config_of(known, out).slam, em_iterations=1)
     config = config_of(known, out, truth_objects=None, every=2, online=True, slam=short)
-    write = pipeline.write_crops
+    write = pipeline.write_thumbnails
 
     def interrupted(folder: Path, *arguments: Any) -> None:
         write(folder, *arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "write_crops", interrupted)
+    monkeypatch.setattr(pipeline, "write_thumbnails", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(config)
     assert not (out / "crops").exists() and not (out / "summary.json").exists()
     assert read_json(out / "run.json")["complete"] == ["odometry", "observe", "slam", "map"]
-    monkeypatch.setattr(pipeline, "write_crops", write)
+    monkeypatch.setattr(pipeline, "write_thumbnails", write)
     calls = known.model.calls
     summary = run(config)
     assert known.model.calls == calls  # only the rest is done

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.cli import main
-from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.posterior.model_folder import save
 from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
@@ -21,7 +21,7 @@ from tests.factories import tiny_model
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("drive")
     rng = np.random.default_rng(0)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         simulate_circuit(rng, laps=2, frames_per_lap=60), rng, world=WorldConfig(objects=25, categories=4, latent_dim=4)
     )
     times = np.arange(len(drive.truth)) * 0.1 + 100.0

@@ -30,7 +30,7 @@ from nolbo_ppl.io.tensors import load_tensors
 from nolbo_ppl.models.model_config import ModelConfig, nano, tiny
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.training import stage_data as training
 from nolbo_ppl.training.stages import StageRun
 
@@ -49,7 +49,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A training folder of 12 scenes of 64 px, and 26 held-out ones."""
     root = tmp_path_factory.mktemp("folders")
     for name, seed, count in (("train", 3, 12), ("held_out", 4, 26)):
-        write_scenes(root / name, SceneSource(preset("easy", 64), seed, instances=2), count)
+        write_scenes(root / name, SceneGenerator(preset("easy", 64), seed, instances=2), count)
     return root / "train", root / "held_out"
 
 
@@ -181,7 +181,7 @@ def test_mixed_difficulties_are_thirds(tmp_path: Path, monkeypatch: pytest.Monke
         single_steps=0,
         workers=1,
     )
-    monkeypatch.setattr(training, "LEAST_HELD_OUT", 4)
+    monkeypatch.setattr(training, "MIN_HELD_OUT", 4)
     data = training.TrainingData(config, 0, 1)
     assert len(data.train) == 12
     sources = [read_json(path) for path in (tmp_path / "scenes").glob("*/source.json")]
@@ -191,7 +191,7 @@ def test_mixed_difficulties_are_thirds(tmp_path: Path, monkeypatch: pytest.Monke
     from_worlds = data.train.batch(np.arange(8, 12))
     assert (from_worlds["instance"][from_worlds["present"]] >= 1_000_000).all()
     first = data.train.batch(np.arange(4))["image"]
-    np.testing.assert_array_equal(first[0], SceneSource(preset("standard", 64), 0).render(0).image.transpose(2, 0, 1))
+    np.testing.assert_array_equal(first[0], SceneGenerator(preset("standard", 64), 0).render(0).image.transpose(2, 0, 1))
 
 
 def test_metrics_have_a_row_a_step_whose_terms_make_the_loss(uninterrupted: Path) -> None:
@@ -460,15 +460,15 @@ def test_nan_in_data_is_refused(folders: tuple[Path, Path], tmp_path: Path, brok
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_term(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from nolbo_ppl.training.scene_supply import SceneSupply
+    from nolbo_ppl.training.scene_loader import SceneLoader
 
-    original = SceneSupply.batch
+    original = SceneLoader.batch
 
-    def batch(self: SceneSupply, step: int) -> Any:
+    def batch(self: SceneLoader, step: int) -> Any:
         found = original(self, step)
         return found if step < 2 or found.noise is None else found.replace(noise=found.noise * torch.nan)
 
-    monkeypatch.setattr(SceneSupply, "batch", batch)
+    monkeypatch.setattr(SceneLoader, "batch", batch)
     with pytest.raises(NolboError, match=r"loss of step 2 is nan: terms that are not finite: \{'voxels': nan\}"):
         run(config_of(folders, tmp_path, objective="elbo", orientation="angle"))
 
@@ -494,7 +494,7 @@ def test_ill_formed_options(folders: tuple[Path, Path], tmp_path: Path, changes:
 
 DOUBLE_PRECISION = """
 import sys, torch
-import nolbo_ppl.training.scene_supply as supply
+import nolbo_ppl.training.scene_loader as supply
 from nolbo_ppl.cli.train import main
 torch.set_default_dtype(torch.float64)
 to_batch = supply.to_batch

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nolbo_ppl.cli.view import ViewArguments, main, run
+from nolbo_ppl.cli.view import ViewerConfig, main, run
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import quaternion_to_matrix
 from nolbo_ppl.report import read_run
@@ -127,7 +127,7 @@ def test_page_loads_without_script_errors(viewer: Viewer, server: viser.ViserSer
 def test_verb_serves_until_it_is_stopped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stop = threading.Event()
     stop.set()
-    run(ViewArguments(folder, port=PORT + 50, browser=False), stop)
+    run(ViewerConfig(folder, port=PORT + 50, browser=False), stop)
     assert re.search(r"http://localhost:\d+", capsys.readouterr().out)
 
 
@@ -143,4 +143,4 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no result of a run"):
         main([str(tmp_path), "--no-browser"])
     with pytest.raises(InputError, match="no such folder"):
-        run(ViewArguments(tmp_path / "nowhere"))
+        run(ViewerConfig(tmp_path / "nowhere"))

@@ -17,8 +17,8 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
 from nolbo_ppl.synthetic.scenes.scene_config import easy, standard
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
-from nolbo_ppl.training.scene_supply import JoinedScenes
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+from nolbo_ppl.training.scene_loader import ConcatScenes
 
 FIELDS = {
     "image",
@@ -41,12 +41,12 @@ FIELDS = {
 
 
 @pytest.fixture(scope="module")
-def source() -> SceneSource:
-    return SceneSource(standard(32), seed=5, instances=2)
+def source() -> SceneGenerator:
+    return SceneGenerator(standard(32), seed=5, instances=2)
 
 
 @pytest.fixture(scope="module")
-def cached(source: SceneSource, tmp_path_factory: pytest.TempPathFactory) -> Iterator[CachedScenes]:
+def cached(source: SceneGenerator, tmp_path_factory: pytest.TempPathFactory) -> Iterator[CachedScenes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cache, "BLOCK", 8)
         yield write_cache(tmp_path_factory.mktemp("cache"), source, 20)
@@ -59,7 +59,7 @@ def assert_equal(a: Arrays, b: Arrays) -> None:
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
-def test_cached_scenes_are_the_rendered_ones(source: SceneSource, cached: CachedScenes) -> None:
+def test_cached_scenes_are_the_rendered_ones(source: SceneGenerator, cached: CachedScenes) -> None:
     direct = render_batch(source, 0, 20)
     assert direct["present"].sum() > 20
     assert_equal(cached.batch(range(20)), direct)
@@ -73,8 +73,8 @@ def test_cached_scenes_are_the_rendered_ones(source: SceneSource, cached: Cached
 def test_joined_caches_are_one_data_set(cached: CachedScenes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes of both in any order, shapes of both once; the pool of shapes is the same."""
     monkeypatch.setattr(cache, "BLOCK", 8)
-    other = write_cache(tmp_path, SceneSource(easy(32), seed=5, instances=2), 8)
-    joined = JoinedScenes([cached, other])
+    other = write_cache(tmp_path, SceneGenerator(easy(32), seed=5, instances=2), 8)
+    joined = ConcatScenes([cached, other])
     assert len(joined) == 28
     index = np.array([3, 25, 19, 20, 0, 27])
     batch = joined.batch(index)
@@ -92,35 +92,35 @@ def test_joined_caches_are_one_data_set(cached: CachedScenes, tmp_path: Path, mo
             assert category[row] == label
 
 
-def test_shapes_of_a_cache(source: SceneSource, cached: CachedScenes) -> None:
+def test_shapes_of_a_cache(source: SceneGenerator, cached: CachedScenes) -> None:
     number, packed, category = cached.shapes()
     assert (np.diff(number) > 0).all()
     for n, bits, c in zip(number, packed, category):
-        item = source.pool.item_of(int(n))
+        item = source.pool.asset_of(int(n))
         np.testing.assert_array_equal(bits, item.voxels)
         assert cached.categories[c] == item.shape.category
 
 
-def test_cache_is_resumed_and_extended(source: SceneSource, cached: CachedScenes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_is_resumed_and_extended(source: SceneGenerator, cached: CachedScenes, monkeypatch: pytest.MonkeyPatch) -> None:
     root = cached.folder.parent
-    render = SceneSource.render
+    render = SceneGenerator.render
     drawn: list[int] = []
 
-    def dying(self: SceneSource, index: int):
+    def dying(self: SceneGenerator, index: int):
         drawn.append(index)
         if len(drawn) == 12:
             raise KeyboardInterrupt
         return render(self, index)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SceneSource, "render", dying)
+        patch.setattr(SceneGenerator, "render", dying)
         with pytest.raises(KeyboardInterrupt):
             write_cache(root, source, 40)
     assert drawn == list(range(24, 36))  # three shards of eight were there
     assert len(list(cached.folder.glob(".shard-*.tmp"))) == 1
     drawn.clear()
     with monkeypatch.context() as patch:
-        patch.setattr(SceneSource, "render", lambda self, index: drawn.append(index) or render(self, index))
+        patch.setattr(SceneGenerator, "render", lambda self, index: drawn.append(index) or render(self, index))
         longer = write_cache(root, source, 40)
         assert drawn == list(range(32, 40))  # the shard finished before the kill is kept
         write_cache(root, source, 40)
@@ -130,17 +130,17 @@ def test_cache_is_resumed_and_extended(source: SceneSource, cached: CachedScenes
     assert_equal(longer.batch([33]), render_batch(source, 33, 1))
 
 
-def test_cache_key_tells_scenes_apart(source: SceneSource, tmp_path: Path) -> None:
+def test_cache_key_tells_scenes_apart(source: SceneGenerator, tmp_path: Path) -> None:
     keys = {
         cache_key(source),
         cache_key(source, slots=6),
-        cache_key(SceneSource(easy(32), seed=5, instances=2)),
-        cache_key(SceneSource(standard(32), seed=6, instances=2)),
-        cache_key(SceneSource(standard(32), seed=5, instances=3)),
-        cache_key(SceneSource(standard(64), seed=5, instances=2)),
+        cache_key(SceneGenerator(easy(32), seed=5, instances=2)),
+        cache_key(SceneGenerator(standard(32), seed=6, instances=2)),
+        cache_key(SceneGenerator(standard(32), seed=5, instances=3)),
+        cache_key(SceneGenerator(standard(64), seed=5, instances=2)),
     }
     assert len(keys) == 6
-    assert cache_key(SceneSource(standard(32), seed=5, instances=2)) == cache_key(source)
+    assert cache_key(SceneGenerator(standard(32), seed=5, instances=2)) == cache_key(source)
     with pytest.raises(InputError, match="number of cached scenes: got 0"):
         write_cache(tmp_path, source, 0)
     with pytest.raises(InputError, match="not enough scenes in the cache: got 0 scenes"):
@@ -166,7 +166,7 @@ def test_shuffled_batches_resume(cached: CachedScenes) -> None:
         assert_equal(a, b)
 
 
-def test_streamed_batches_resume(source: SceneSource) -> None:
+def test_streamed_batches_resume(source: SceneGenerator) -> None:
     whole = list(islice(streamed_batches(source, 3), 4))
     assert_equal(whole[2], render_batch(source, 6, 3))
     for a, b in zip(whole[2:], islice(streamed_batches(source, 3, start=2), 2)):
@@ -174,7 +174,7 @@ def test_streamed_batches_resume(source: SceneSource) -> None:
 
 
 @pytest.mark.slow
-def test_streaming_does_not_depend_on_the_number_of_workers(source: SceneSource) -> None:
+def test_streaming_does_not_depend_on_the_number_of_workers(source: SceneGenerator) -> None:
     stream = streamed_batches(source, 2, workers=2)
     for step, batch in zip(range(5), stream):
         assert_equal(batch, render_batch(source, 2 * step, 2))

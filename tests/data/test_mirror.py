@@ -12,7 +12,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels
-from nolbo_ppl.training.scene_supply import SceneSupply, ShapeTable
+from nolbo_ppl.training.scene_loader import SceneLoader, ShapeTable
 from tests.factories import random_batch, tiny_config, tiny_model
 
 
@@ -84,7 +84,7 @@ def test_the_supply_mirrors_half_the_scenes_with_their_latents() -> None:
     batch = batch.replace(instance=torch.arange(12).reshape(6, 2))
     model = tiny_model(config)
     table = ShapeTable(np.arange(12), batch.voxels.flatten(0, 1).numpy(), batch.category.flatten().numpy())
-    table.teach(model, mirrored=True)
+    table.encode_shapes(model, mirrored=True)
     still = Augmentation(
         geometric_probability=0.0,
         mirror_probability=0.5,
@@ -96,7 +96,7 @@ def test_the_supply_mirrors_half_the_scenes_with_their_latents() -> None:
         noise_probability=0.0,
         inversion_probability=0.0,
     )
-    supply = SceneSupply(_Folder(batch), table, 6, 0, config.latent_dim, still)
+    supply = SceneLoader(_Folder(batch), table, 6, 0, config.latent_dim, still)
     mirrored = plain = 0
     for step in range(4):
         found = supply.batch(step)
@@ -108,6 +108,6 @@ def test_the_supply_mirrors_half_the_scenes_with_their_latents() -> None:
             mirrored += flipped
             plain += not flipped
     assert mirrored > 4 and plain > 4
-    table.teach(model)
+    table.encode_shapes(model)
     with pytest.raises(InputError, match="latents of mirrored shapes"):
         supply.batch(0)

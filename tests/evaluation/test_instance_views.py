@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.evaluation.instance_views import LEAST_VISIBILITY, InstanceViews, render_view
+from nolbo_ppl.evaluation.instance_views import MIN_VISIBILITY, InstanceViews, render_view
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.shapes import shape_from_seed
 
 
 @pytest.fixture(scope="module")
 def source():
-    return SceneSource(preset("standard", 64), seed=3, instances=5)
+    return SceneGenerator(preset("standard", 64), seed=3, instances=5)
 
 
 def test_views_show_the_instance_and_differ_in_all_else(source):
@@ -25,7 +25,7 @@ def test_views_show_the_instance_and_differ_in_all_else(source):
         assert shape.instance == shape_from_seed(category, 300_002).instance
         for view in (one, two):
             assert len(view.box) == 1 and view.category[0] == category
-            assert view.visibility[0] >= LEAST_VISIBILITY and view.diagonal[0] == pytest.approx(shape.diagonal)
+            assert view.visibility[0] >= MIN_VISIBILITY and view.diagonal[0] == pytest.approx(shape.diagonal)
             np.testing.assert_array_equal(view.voxels[0], source.pool.item(category, 2).voxels)
             assert max(view.box[0, 2:] - view.box[0, :2]) > 12
         assert (one.image != two.image).mean() > 0.5
@@ -41,7 +41,7 @@ def test_a_view_depends_on_its_arguments_alone(source):
 
 def test_instances_are_listed_by_category():
     shapes = [shape_from_seed(name, k) for name, count in (("car", 3), ("bus", 1), ("chair", 2)) for k in range(count)]
-    source = SceneSource(preset("easy", 64), cad=tuple(shapes))
+    source = SceneGenerator(preset("easy", 64), cad=tuple(shapes))
     assert InstanceViews(source, 2, CATEGORIES).instances == [("car", 0), ("car", 1), ("chair", 0), ("chair", 1)]
     assert InstanceViews(source, 100, ("chair",)).instances == [("chair", 0), ("chair", 1)]
     assert InstanceViews(source, 100, ("bus",)).instances == []

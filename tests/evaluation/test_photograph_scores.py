@@ -9,7 +9,7 @@ import pytest
 
 from nolbo_ppl.data.converters.photographs import Photograph
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.evaluation.photograph_scores import PhotographAnswer, Viewpoints, match_photographs, photograph_scores
+from nolbo_ppl.evaluation.photograph_scores import PhotographDetections, Viewpoints, match_photographs, photograph_scores
 
 NAMES = ("car", "boat")
 
@@ -22,11 +22,11 @@ def photo(boxes: list, labels: list, exhaustive: set, ignore: list | None = None
     )  # fmt: skip
 
 
-def answer(boxes: list, objectness: list, labels: list, sure: float = 0.9) -> PhotographAnswer:
+def answer(boxes: list, objectness: list, labels: list, sure: float = 0.9) -> PhotographDetections:
     posterior = np.full((len(boxes), 2), 1 - sure)
     posterior[np.arange(len(boxes)), labels] = sure
     box = np.array(boxes, dtype=float).reshape(-1, 4)
-    return PhotographAnswer(box, np.array(objectness, dtype=float), posterior, np.zeros(len(box)))
+    return PhotographDetections(box, np.array(objectness, dtype=float), posterior, np.zeros(len(box)))
 
 
 CAR, OTHER, SMALL, FREE = [10, 10, 60, 60], [100, 100, 160, 160], [70, 10, 80, 20], [10, 100, 60, 150]

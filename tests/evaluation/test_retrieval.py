@@ -11,7 +11,7 @@ from nolbo_ppl.evaluation.retrieval import (
     log_evidence_ratio,
     log_overlap,
     rank_of_own,
-    retrieval_figures,
+    retrieval_scores,
     retrieval_table,
     retrieve,
 )
@@ -78,11 +78,11 @@ def instances(noise, per=20, labels=3, d=6, seed=3):
 def test_sharp_views_find_their_instance_and_noise_does_not():
     found = retrieve(*instances(0.01))
     assert all((rank == 1).all() for rank in found.rank.values()) and (found.gallery == 20).all()
-    figures = retrieval_figures(found, np.random.default_rng(0), 100)
+    figures = retrieval_scores(found, np.random.default_rng(0), 100)
     assert figures["retrieval_recall1"].value == 1.0 and figures["retrieval_median_rank"].value == 1.0
     assert 0.9 < figures["retrieval_recall1"].low < 1.0
     lost = retrieve(*instances(100.0, per=50, labels=12))
-    recall = retrieval_figures(lost, np.random.default_rng(0), 100)["retrieval_recall1"]
+    recall = retrieval_scores(lost, np.random.default_rng(0), 100)["retrieval_recall1"]
     # The two directions of a pair are far from independent: the bound is that of one draw an instance.
     assert recall.value == pytest.approx(1 / 50, abs=5 * math.sqrt(0.02 * 0.98 / 600)) and recall.low <= 1 / 50 <= recall.high
 

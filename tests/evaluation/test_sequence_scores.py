@@ -12,17 +12,17 @@ import torch
 from scipy.stats import vonmises
 
 from nolbo_ppl.evaluation.sequence_scores import (
-    coverage_figures,
-    detection_figures,
+    coverage_scores,
+    detection_scores,
     landmark_errors,
-    loop_figures,
-    map_figures,
+    landmark_to_object,
+    loop_scores,
+    map_scores,
     orientation_mass,
-    owners,
-    position_figures,
-    shape_figures,
+    position_scores,
+    shape_scores,
 )
-from nolbo_ppl.evaluation.sequence_truth import MatchResult, read_truth
+from nolbo_ppl.evaluation.sequence_truth import MatchResult, read_ground_truth
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 from nolbo_ppl.geometry.rotation import ray_rotation, viewpoint_to_matrix
 from nolbo_ppl.structures.detections import Detections
@@ -33,12 +33,12 @@ from tests.simulated_sequence import SimulatedDrive
 def test_position_errors_by_range() -> None:
     true = np.array([[0, 0, 2.0], [0, 0, 4.0], [0, 0, 8.0], [np.nan] * 3, [0, 0, 50.0]])
     said = true + np.array([[0, 0, 0.1], [0, 0.3, 0], [0.4, 0, 0], [1, 1, 1], [0, 0, -5.0]])
-    bands = position_figures(said, true)
+    bands = position_scores(said, true)
     assert list(bands) == ["all", "0-5 m", "5-10 m", "40 m and more"]
     assert bands["all"]["count"] == 4 and bands["all"]["median"] == pytest.approx(0.35)
     assert bands["0-5 m"]["median"] == pytest.approx(0.2) and bands["0-5 m"]["p90"] == pytest.approx(0.28)
     assert bands["40 m and more"]["median_share"] == pytest.approx(0.1)
-    assert position_figures(said[:0], true[:0]) == {}
+    assert position_scores(said[:0], true[:0]) == {}
 
 
 def test_mass_of_the_azimuth_region_far_off_axis() -> None:
@@ -70,24 +70,24 @@ def test_loop_pairs_by_enumeration() -> None:
     true = {(i, j) for i, j in far if object_of[i] == object_of[j] >= 0}
     found = {(i, j) for i, j in far if landmark_of[i] == landmark_of[j] >= 0}
     judged = {(i, j) for i, j in found if object_of[i] >= 0 or object_of[j] >= 0}
-    figures = loop_figures(frame, object_of, landmark_of, 50)
+    figures = loop_scores(frame, object_of, landmark_of, 50)
     assert (figures["true_pairs"], figures["found_pairs"]) == (len(true), len(found))
     assert figures["recall"] == pytest.approx(len(true & found) / len(true), abs=1e-6)
     assert figures["precision_strict"] == pytest.approx(len(true & found) / len(found), abs=1e-6)
     assert figures["precision"] == pytest.approx(len(true & found) / len(judged), abs=1e-6)
     assert figures["unlabelled_pairs"] == len(found) - len(judged) > 0
-    nothing = loop_figures(frame, object_of, np.full(80, -1), 50)
+    nothing = loop_scores(frame, object_of, np.full(80, -1), 50)
     assert nothing["precision"] is None and nothing["recall"] == 0.0
 
 
 def test_landmarks_against_objects(drive: SimulatedDrive) -> None:
-    truth = read_truth(drive.folder, names(drive)[:1])
+    truth = read_ground_truth(drive.folder, names(drive)[:1])
     object_of = np.array([0, 0, 0, 1, 1, 2, -1, -1, 3])
     landmark_of = np.array([0, 0, 1, 2, 2, 2, 3, 3, -1])
-    owner, purity = owners(object_of, landmark_of, 5)
+    owner, purity = landmark_to_object(object_of, landmark_of, 5)
     np.testing.assert_array_equal(owner, [0, 0, 1, -1, -1])
     np.testing.assert_allclose(purity, [1, 1, 2 / 3, 1, 0])
-    figures = map_figures(object_of, owner, purity, np.array([True, True, True, True, False]), truth, least_detections=2)
+    figures = map_scores(object_of, owner, purity, np.array([True, True, True, True, False]), truth, least_detections=2)
     assert figures == {
         "landmarks": 4,
         "objects": len(truth),
@@ -100,7 +100,7 @@ def test_landmarks_against_objects(drive: SimulatedDrive) -> None:
 
 
 def test_landmark_errors_do_not_depend_on_the_world_of_the_estimate(drive: SimulatedDrive) -> None:
-    truth = read_truth(drive.folder, names(drive)[:1])
+    truth = read_ground_truth(drive.folder, names(drive)[:1])
     owner = np.array([2, 0, -1])
     T = make_pose(so3_exp(np.array([0.1, 1.0, -0.2])), np.array([3.0, 1.0, -7.0]))
     position = transform(T, np.concatenate([truth.T_world_object[owner[:2], :3, 3], np.zeros((1, 3))]))
@@ -111,7 +111,7 @@ def test_landmark_errors_do_not_depend_on_the_world_of_the_estimate(drive: Simul
 
 def known(drive: SimulatedDrive) -> MatchResult:
     """Every detection with its object, from the simulation itself."""
-    truth, table = read_truth(drive.folder, names(drive)), drive.model.table
+    truth, table = read_ground_truth(drive.folder, names(drive)), drive.model.table
     row = np.full(len(table), -1)
     for k, i in enumerate(drive.object_of):
         hit = np.flatnonzero(truth.shown[table.frame[k]] == i)
@@ -122,25 +122,25 @@ def known(drive: SimulatedDrive) -> MatchResult:
 
 def test_regions_of_honest_noise_hold_what_they_promise(drive: SimulatedDrive) -> None:
     """The simulation draws what it states: 90 % of positions and latents lie inside, within five standard errors."""
-    truth, table, matched = read_truth(drive.folder, names(drive)), drive.model.table, known(drive)
+    truth, table, matched = read_ground_truth(drive.folder, names(drive)), drive.model.table, known(drive)
     model = drive.model
-    figures = coverage_figures(matched, table, truth, model)
+    figures = coverage_scores(matched, table, truth, model)
     error = 5 * math.sqrt(0.9 * 0.1 / figures["count"])
     assert figures["position"] == pytest.approx(0.9, abs=error)
     assert figures["latent"] == pytest.approx(0.9, abs=error)
     assert figures["orientation"] is None
-    narrow = coverage_figures(matched, table, truth, None)
+    narrow = coverage_scores(matched, table, truth, None)
     assert narrow["latent"] is None and narrow["position"] == figures["position"]
-    seen = detection_figures(matched, table, truth)
+    seen = detection_scores(matched, table, truth)
     assert seen["category_accuracy"] == 1.0 and 1.0 < seen["median_rotation_error_deg"] < 6.0
 
 
 def test_shapes_grow_with_views(drive: SimulatedDrive) -> None:
-    truth, table = read_truth(drive.folder, names(drive)), drive.model.table
+    truth, table = read_ground_truth(drive.folder, names(drive)), drive.model.table
     owner = np.arange(len(truth))
-    figures = shape_figures(table, drive.object_of, owner, truth, drive.model, np.random.default_rng(0))
+    figures = shape_scores(table, drive.object_of, owner, truth, drive.model, np.random.default_rng(0))
     assert figures is not None and figures["landmarks"] > 5
     iou = list(figures["iou"].values())
     assert iou[0] < iou[1] < iou[2] <= 1.0
-    few = shape_figures(table.select(np.arange(4)), drive.object_of[:4], owner, truth, drive.model, np.random.default_rng(0))
+    few = shape_scores(table.select(np.arange(4)), drive.object_of[:4], owner, truth, drive.model, np.random.default_rng(0))
     assert few is None

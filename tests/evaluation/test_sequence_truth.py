@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.evaluation.sequence_truth import DriveTruth, match_detections, object_shown, read_truth
+from nolbo_ppl.evaluation.sequence_truth import SequenceGroundTruth, match_detections, object_shown, read_ground_truth
 from nolbo_ppl.structures.annotations import Annotations
 from tests.simulated_sequence import SimulatedDrive
 
@@ -20,7 +20,7 @@ def names(drive: SimulatedDrive) -> list[str]:
 
 
 def test_truth_of_a_drive(drive: SimulatedDrive) -> None:
-    truth = read_truth(drive.folder, names(drive)[5:40:5])
+    truth = read_ground_truth(drive.folder, names(drive)[5:40:5])
     assert len(truth) == len(drive.model.latents) and len(truth.frames) == 7
     seen = truth.frames[2]  # the frames that were asked for, in that order
     T = drive.truth[15]
@@ -31,7 +31,7 @@ def test_truth_of_a_drive(drive: SimulatedDrive) -> None:
 
 def test_every_simulated_detection_finds_its_object(drive: SimulatedDrive) -> None:
     """Boxes follow from noisy positions: what matches is right, and with exact boxes everything matches."""
-    truth, table = read_truth(drive.folder, names(drive)), drive.model.table
+    truth, table = read_ground_truth(drive.folder, names(drive)), drive.model.table
     seen = np.concatenate(truth.shown)
     frame = np.repeat(np.arange(len(truth.frames)), [len(one) for one in truth.frames])
     exact = match_detections(frame, np.concatenate([one.box for one in truth.frames]), np.ones(len(frame)), truth)
@@ -45,12 +45,12 @@ def test_every_simulated_detection_finds_its_object(drive: SimulatedDrive) -> No
     assert (found.object[matched] == drive.object_of[matched]).mean() > 0.98
 
 
-def one_frame(box: list[list[float]], visibility: list[float]) -> DriveTruth:
+def one_frame(box: list[list[float]], visibility: list[float]) -> SequenceGroundTruth:
     n = len(box)
     ids = tuple(str(k) for k in range(n))
     frame = Annotations.from_arrays([100, 100, 50, 50], box, id=ids, visibility=visibility)
     text = tuple("x" * n)
-    return DriveTruth(
+    return SequenceGroundTruth(
         ids, text, text, np.tile(np.eye(4), (n, 1, 1)), np.ones(n), np.ones(n, dtype=int), np.zeros(n, dtype=bool), {}, (frame,)
     )
 
@@ -89,14 +89,14 @@ def test_bad_truth_is_refused(drive: SimulatedDrive, tmp_path: Path, file: str, 
     shutil.copytree(drive.folder, folder)
     (folder / file).write_text(change)
     with pytest.raises(InputError, match=match):
-        read_truth(folder, names(drive))
+        read_ground_truth(folder, names(drive))
 
 
 def test_images_and_shapes_must_be_those_of_the_drive(drive: SimulatedDrive, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not an image of the drive"):
-        read_truth(drive.folder, ["000000.png", "other.png"])
+        read_ground_truth(drive.folder, ["000000.png", "other.png"])
     folder = tmp_path / "drive"
     shutil.copytree(drive.folder, folder)
     np.savez(folder / "voxels.npz", something=np.zeros(4096, dtype=np.uint8))
     with pytest.raises(InputError, match="a true shape is missing"):
-        read_truth(folder, names(drive))
+        read_ground_truth(folder, names(drive))

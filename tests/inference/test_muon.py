@@ -88,7 +88,7 @@ def test_rate_decay_and_pace() -> None:
     for name in ("kernel.weight", "last.weight"):
         module.get_parameter(name).grad.zero_()
     kernel, last = module.kernel.weight.detach().clone(), module.last.weight.detach().clone()
-    optimizer = MuonAdamW(module, 1.0, 0.5, pace=4.0)
+    optimizer = MuonAdamW(module, 1.0, 0.5, matrix_lr_scale=4.0)
     for group in optimizer.param_groups:
         group["lr"] = 0.01
     calls: list[int] = []

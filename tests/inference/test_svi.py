@@ -14,14 +14,14 @@ from torch import Tensor, nn
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import ElboResult, SceneELBO, SceneLoss
-from nolbo_ppl.inference.svi import OptimisationConfig, OptimisationState, learning_rate
+from nolbo_ppl.inference.svi import OptimizerConfig, OptimizerState, learning_rate
 from nolbo_ppl.io.tensors import load_tensors, save_tensors
 from nolbo_ppl.training.stages import scene_weights
 from tests.factories import random_batch, tiny_config, tiny_model
 
 
 def test_schedule() -> None:
-    config = OptimisationConfig(steps=100, learning_rate=1.0, start_rate=0.1, warmup=10, decay=0.2)
+    config = OptimizerConfig(steps=100, learning_rate=1.0, start_rate=0.1, warmup=10, decay=0.2)
     rates = [learning_rate(config, step) for step in range(100)]
     assert rates[:10] == pytest.approx([0.1 + 0.09 * k for k in range(1, 11)])
     assert rates[10:80] == [1.0] * 70
@@ -29,7 +29,7 @@ def test_schedule() -> None:
     assert rates[89] == pytest.approx(0.02 + 0.98 / 2)
     assert all(a > b for a, b in itertools.pairwise(rates[80:]))
     assert learning_rate(config, 150) == pytest.approx(0.02)
-    held = OptimisationConfig(steps=100, learning_rate=1.0, warmup=0, decay=0.0)
+    held = OptimizerConfig(steps=100, learning_rate=1.0, warmup=0, decay=0.0)
     assert [learning_rate(held, step) for step in (0, 50, 99, 200)] == [1.0] * 4
 
 
@@ -44,7 +44,7 @@ def test_average_against_a_hand_loop_and_decay_of_matrices_only() -> None:
     module = nn.Linear(3, 2)
     module.register_buffer("count", torch.tensor(0))
     target = torch.randn(2, 3)
-    config = OptimisationConfig(steps=40, learning_rate=0.05, warmup=1, decay=0.0, ema=0.9, weight_decay=0.1)
+    config = OptimizerConfig(steps=40, learning_rate=0.05, warmup=1, decay=0.0, ema=0.9, weight_decay=0.1)
     state = optimisation.init(module, lambda: quadratic(target, module), config)
     by_name = {group["weight_decay"]: [p.shape for p in group["params"]] for group in state.optimizer.param_groups}
     assert by_name == {0.1: [(2, 3)], 0.0: [(2,)]}
@@ -66,7 +66,7 @@ def test_a_step_is_adamw_by_hand() -> None:
     with torch.no_grad():
         module.weight.fill_(3.0)
         module.bias.fill_(-4.0)
-    config = OptimisationConfig(steps=10, learning_rate=0.1, start_rate=0.0, warmup=1, weight_decay=0.5, clip=1.0)
+    config = OptimizerConfig(steps=10, learning_rate=0.1, start_rate=0.0, warmup=1, weight_decay=0.5, clip=1.0)
     state = optimisation.init(module, lambda: quadratic(torch.zeros(1, 1), module), config)
     _, info = optimisation.step(state)
     assert info.loss == pytest.approx(25.0)
@@ -78,11 +78,11 @@ def test_a_step_is_adamw_by_hand() -> None:
     assert module.weight.grad.item() == pytest.approx(0.6, abs=1e-6)
 
 
-def scene_state(seed: int = 0, optimizer: str = "adamw") -> OptimisationState:
+def scene_state(seed: int = 0, optimizer: str = "adamw") -> OptimizerState:
     model = tiny_model(seed=seed)
     model.shape_guide.requires_grad_(False)
     loss = SceneLoss(model.story, model.guide, SceneELBO(scene_weights("inclusive", {"voxels": 0.01})))
-    config = OptimisationConfig(steps=6, learning_rate=1e-2, warmup=2, decay=0.5, ema=0.9, optimizer=optimizer)
+    config = OptimizerConfig(steps=6, learning_rate=1e-2, warmup=2, decay=0.5, ema=0.9, optimizer=optimizer)
     return optimisation.init(model, loss, config)
 
 
@@ -155,7 +155,7 @@ def test_a_gradient_that_is_not_finite_leaves_the_weights() -> None:
     module = nn.Linear(1, 1)
     nn.init.zeros_(module.weight)
     state = optimisation.init(
-        module, lambda: ElboResult({}, module.weight.abs().sqrt().sum() + module.bias.sum()), OptimisationConfig()
+        module, lambda: ElboResult({}, module.weight.abs().sqrt().sum() + module.bias.sum()), OptimizerConfig()
     )
     before = module.bias.detach().clone()
     with pytest.raises(NolboError, match="gradient of step 0 is not finite"):

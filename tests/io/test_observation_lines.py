@@ -10,7 +10,7 @@ import pytest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import so3_exp
-from nolbo_ppl.io.observations import check_table, concatenate, make_table, read_observations, write_observations
+from nolbo_ppl.io.observations import Detections, check_table, read_observations, write_observations
 
 LINE = {"frame": 0, "position": [1.0, 2.0, 3.0]}
 MODE = {"weight": 1.0, "rotation": [0.0, 0.0, 0.0, 1.0], "std": 0.1}
@@ -25,7 +25,7 @@ def test_round_trip_of_every_field(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     n = 5
     root = rng.standard_normal((n, 3, 3))
-    table = make_table(
+    table = Detections.from_arrays(
         np.arange(n),
         rng.standard_normal((n, 3)),
         position_covariance=root @ np.swapaxes(root, 1, 2) + np.eye(3),
@@ -56,7 +56,7 @@ def test_round_trip_of_every_field(tmp_path: Path) -> None:
         np.testing.assert_allclose(getattr(back, name), getattr(table, name), rtol=2e-6, atol=2e-6, err_msg=name)
     assert back.category == table.category and back.id == table.id
     check_table(back, n)
-    joined = concatenate([back.select(np.array([0, 1])), back.select(np.array([2, 3, 4]))])
+    joined = Detections.concatenate([back.select(np.array([0, 1])), back.select(np.array([2, 3, 4]))])
     assert joined.id == back.id and joined.category == back.category
 
 
@@ -145,7 +145,7 @@ def test_duplicate_ids_and_mixed_latents(tmp_path: Path) -> None:
 def test_tables_are_checked(change: dict[str, object], match: str) -> None:
     fields: dict[str, object] = {"frame": [0, 1], "position": np.ones((2, 3)), "id": ["good", "bad"], **change}
     with pytest.raises(InputError, match=f"'bad'.*{match}"):
-        check_table(make_table(**fields), frames=5)  # type: ignore[arg-type]
+        check_table(Detections.from_arrays(**fields), frames=5)  # type: ignore[arg-type]
 
 
 def test_modes_of_orientations_round_trip(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_modes_of_orientations_round_trip(tmp_path: Path) -> None:
     for name in ("mode_weight", "mode_rotation", "mode_std", "rotation"):
         np.testing.assert_allclose(getattr(back, name), getattr(table, name), atol=1e-7)
     check_table(back, 1)
-    joined = concatenate([make_table([0], [[0, 0, 1.0]]), back.select(np.array([1, 2]))])
+    joined = Detections.concatenate([Detections.from_arrays([0], [[0, 0, 1.0]]), back.select(np.array([1, 2]))])
     np.testing.assert_allclose(joined.mode_weight, table.mode_weight)
 
 
@@ -176,13 +176,13 @@ def test_modes_of_a_table_are_checked() -> None:
         "mode_rotation": np.tile(np.eye(3), (2, 1, 1, 1)),
         "id": ["good", "bad"],
     }
-    check_table(make_table(**fields), 1)
+    check_table(Detections.from_arrays(**fields), 1)
     with pytest.raises(InputError, match="incomplete"):
-        make_table([0], np.ones((1, 3)), mode_weight=np.ones((1, 1)))
+        Detections.from_arrays([0], np.ones((1, 3)), mode_weight=np.ones((1, 1)))
     for change, match in (
         ({"mode_weight": [[1.0], [-1.0]]}, "mode_weight"),
         ({"mode_std": [[0.1], [0.0]]}, "mode_std"),
         ({"mode_rotation": np.stack([np.eye(3), 2 * np.eye(3)])[:, None]}, "mode_rotation"),
     ):
         with pytest.raises(InputError, match=f"'bad'.*{match}"):
-            check_table(make_table(**{**fields, "rotation": np.eye(3), **change}), 1)
+            check_table(Detections.from_arrays(**{**fields, "rotation": np.eye(3), **change}), 1)

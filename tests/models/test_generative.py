@@ -13,7 +13,7 @@ from pyro import poutine
 from scipy.stats import chisquare
 
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
-from nolbo_ppl.models.generative import conjugate_truth
+from nolbo_ppl.models.generative import conjugate_target
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import ObservedScene
 from tests.factories import instance_config, observed_scene, random_batch, repeat_scene, tiny_config, tiny_model
@@ -84,13 +84,13 @@ def test_simulation_based_calibration(name: str, scale: float) -> None:
         trace = poutine.trace(poutine.uncondition(model.story)).get_trace(scene, decode=0)
     latent, observed = trace.nodes[f"{name}_latent"]["value"], trace.nodes[name]["value"]
     assert abs(float((observed - latent).std()) - scale) < 5 * scale / math.sqrt(2 * observed.numel())
-    draws = conjugate_truth(observed, scale).sample((19,))
+    draws = conjugate_target(observed, scale).sample((19,))
     rank = (draws < latent).sum(0).flatten().numpy()
     counts = np.bincount(rank, minlength=20)
     assert counts.sum() == 400 * 2 * 4
     assert chisquare(counts).pvalue > 1e-3
     # the test can fail: a posterior a fifth too narrow is found out
-    narrow = conjugate_truth(observed, scale).mean + 0.8 * (draws - conjugate_truth(observed, scale).mean)
+    narrow = conjugate_target(observed, scale).mean + 0.8 * (draws - conjugate_target(observed, scale).mean)
     wrong = np.bincount((narrow < latent).sum(0).flatten().numpy(), minlength=20)
     assert chisquare(wrong).pvalue < 1e-3
 

@@ -77,7 +77,7 @@ def test_at_the_mode_the_likeliest_category_has_the_mean() -> None:
     residual = torch.tensor([[0.1, -0.2, 0.3, 0.4], [0.5, 0.6, -0.7, 0.8]]).double()
     raw[:, 4:8] = residual
     q = model.guide.head.parameters_of(raw, prior_mean)
-    mode = q.at_mode(prior_mean)
+    mode = q.at_map_category(prior_mean)
     torch.testing.assert_close(mode.shape_loc, prior_mean[[1, 2]] + residual)
     assert not torch.allclose(mode.shape_loc, q.shape_loc)
     assert mode.shape_scale is q.shape_scale and mode.label_logits is q.label_logits

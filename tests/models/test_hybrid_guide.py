@@ -10,7 +10,7 @@ import torch
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.elbo import INCLUSIVE, SceneELBO, SceneLoss
 from nolbo_ppl.models.crops import BOX_SIDE, SIDE, cut_out, image_levels
-from nolbo_ppl.models.evidence import COCO_LABELS, LEAST_LOG, ROLE_SIDE, WEAK, bin_best, detector_evidence
+from nolbo_ppl.models.evidence import COCO_LABELS, MIN_LOG, ROLE_SIDE, WEAK, bin_best, detector_evidence
 from nolbo_ppl.models.hybrid_guide import HybridGuide, assign_regions, known_regions
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import cell_of, decode_box, decode_range, encode_range
@@ -75,8 +75,8 @@ def test_a_detectors_evidence_is_its_own_odds() -> None:
     own = [COCO_LABELS[name] for name in CONFIG.categories]
     probability = torch.sigmoid(predictions.objectness) * torch.sigmoid(predictions.classes[..., own]).amax(-1)
     index, found = bin_best(box, torch.logit(probability), 4, 4, CONFIG)
-    expected = torch.where(found, torch.logit(probability).gather(1, index), LEAST_LOG)
-    torch.testing.assert_close(evidence.log_odds, expected.clamp_min(LEAST_LOG))
+    expected = torch.where(found, torch.logit(probability).gather(1, index), MIN_LOG)
+    torch.testing.assert_close(evidence.log_odds, expected.clamp_min(MIN_LOG))
     b, k = (value[0] for value in found.nonzero(as_tuple=True))
     trucks = torch.nn.functional.logsigmoid(predictions.classes[b, index[b, k], 7])
     torch.testing.assert_close(evidence.labels[b, k, len(own)], trucks)

@@ -9,21 +9,21 @@ import torch
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.models.model_config import ModelConfig
-from nolbo_ppl.models.roi_refinement import LEAST_SIDE, MARGIN, GlimpseBlock, glimpse_grid, sample_map
+from nolbo_ppl.models.roi_refinement import MARGIN, MIN_SIDE, RoiRefinementBlock, roi_grid, sample_map
 from nolbo_ppl.models.scene_batch import decode_box, encode_box
 from tests.factories import random_batch, tiny_config, tiny_model
 
 
 def test_the_grid_covers_the_enlarged_box() -> None:
     box = torch.tensor([[10.0, 20.0, 50.0, 30.0]])
-    points = glimpse_grid(box, 4)[0]
+    points = roi_grid(box, 4)[0]
     assert points.shape == (4, 4, 2)
     torch.testing.assert_close(points.mean((0, 1)), torch.tensor([30.0, 25.0]))
     step = points[:, 1:, 0] - points[:, :-1, 0]
     torch.testing.assert_close(step, torch.full((4, 3), 40 * MARGIN / 4))
     assert float(points[0, 0, 1]) == pytest.approx(25 - 12 * 3 / 8)
-    small = glimpse_grid(torch.tensor([[5.0, 5, 5, 5]]), 2)[0]
-    assert float(small[0, 1, 0] - small[0, 0, 0]) == pytest.approx(LEAST_SIDE / 2)
+    small = roi_grid(torch.tensor([[5.0, 5, 5, 5]]), 2)[0]
+    assert float(small[0, 1, 0] - small[0, 0, 0]) == pytest.approx(MIN_SIDE / 2)
 
 
 @pytest.mark.parametrize("stride", [4, 8])
@@ -66,7 +66,7 @@ def test_the_second_look_keeps_the_box_and_sees_only_its_surroundings(changes: d
     assert not torch.allclose(refined[:, :first], raw[:, :first])
     refined.sum().backward()
     box = decode_box(head.box_latent(raw), cell, encoding.columns, model.config)[0].detach()
-    half = (box[2:] - box[:2]).mul(MARGIN).clamp_min(LEAST_SIDE) / 2
+    half = (box[2:] - box[:2]).mul(MARGIN).clamp_min(MIN_SIDE) / 2
     low, high = (box[:2] + box[2:]) / 2 - half, (box[:2] + box[2:]) / 2 + half
     used_maps = model.config.glimpse_maps
     assert all(m.grad is None for m in fine[used_maps:])
@@ -128,7 +128,7 @@ def test_configurations_without_a_second_look() -> None:
 
 
 def test_blocks_of_the_second_look_start_as_the_identity_and_learn() -> None:
-    block = GlimpseBlock(8)
+    block = RoiRefinementBlock(8)
     x = torch.randn(2, 8, 5, 5, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(block(x), x, rtol=0, atol=0)
     block(x).square().sum().backward()
@@ -150,7 +150,7 @@ def test_details_are_sampled_twice_as_densely() -> None:
         glimpse.look[0].weight.zero_()
         glimpse.look[1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
         glimpse([fine, torch.zeros(1, config.encoder_channels[2], 6, 6)], row, box, torch.zeros(1, 4))
-    points = glimpse_grid(box, side)
+    points = roi_grid(box, side)
     offset = (box[:, 2:] - box[:, :2]) * MARGIN / side / 4
     corners = [points + offset * torch.tensor([a, b]) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     expected = sum(sample_map(fine, row, c.flatten(1, 2), 4)[..., 0] for c in corners) / 4

@@ -101,7 +101,7 @@ def test_bound_of_the_shape_autoencoder(instances: bool) -> None:
     category, instance = torch.tensor([2, 2, 1, 0]), torch.tensor([1, -1, 0, -1])
     batch = ShapeBatch(scene.voxels[0], category, instance, scene.noise[0])
     with torch.no_grad():
-        result = SceneELBO(PURE_BOUND).evaluate(model.shape_story, model.shape_guide, batch, scenes=4)
+        result = SceneELBO(PURE_BOUND).evaluate(model.shape_model, model.shape_guide, batch, scenes=4)
         loc, scale = model.shape_guide.posterior(batch.voxels)
         mean = model.story.prior.category_mean()[category]
         if instances:

@@ -16,13 +16,13 @@ from tests.factories import tiny_model
 
 @pytest.mark.slow
 def test_the_demonstration_ends_in_a_table_and_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    preset, asked = drives.drive_preset, []
+    preset, asked = drives.sequence_preset, []
 
-    def small(name: str, world: drives.config.WorldName, seed: int) -> drives.DriveConfig:
+    def small(name: str, world: drives.config.WorldName, seed: int) -> drives.SequenceConfig:
         asked.append((name, world, seed))
         return replace(preset("demo", world, seed), frames=6, laps=0.3, step=5.0, size=(128, 64), objects=8, clutter=4)
 
-    monkeypatch.setattr(drives, "drive_preset", small)
+    monkeypatch.setattr(drives, "sequence_preset", small)
     save(tmp_path / "model", tiny_model(scatter=0.1).float(), Calibration(objectness_shift=-2.0), {})
     result = run_demo(tmp_path / "demo", seed=2, model=str(tmp_path / "model"))
     assert asked == [("demo", "street", DEMO_SEED + 2)]

@@ -13,7 +13,7 @@ from PIL import Image
 from nolbo_ppl.geometry.pose import make_pose, matrix_to_quaternion, so3_exp
 from nolbo_ppl.io.landmarks import parse_landmark
 from nolbo_ppl.pipeline.map_mesh import build_scene, landmark_mesh, write_glb
-from nolbo_ppl.pipeline.thumbnails import LONGEST, best_views, cut, write_crops
+from nolbo_ppl.pipeline.thumbnails import LONGEST, best_views, cut, write_thumbnails
 from nolbo_ppl.structures.association_table import AssociationTable
 from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.landmark import Landmark
@@ -89,11 +89,11 @@ def test_best_views_weigh_probability_objectness_and_size(tmp_path: Path) -> Non
         read.append(k)
         return np.full((48, 64, 3), 10 * k, dtype=np.uint8)
 
-    write_crops(tmp_path / "crops", {**views, "L2": views["L1"]}, image)
+    write_thumbnails(tmp_path / "crops", {**views, "L2": views["L1"]}, image)
     assert read == [1, 2]  # each image once
     assert sorted(path.name for path in (tmp_path / "crops").iterdir()) == ["L0.png", "L1.png", "L2.png"]
     assert int(np.asarray(Image.open(tmp_path / "crops" / "L0.png")).mean()) == 10
-    write_crops(tmp_path / "none", {}, image)
+    write_thumbnails(tmp_path / "none", {}, image)
     assert list((tmp_path / "none").iterdir()) == []
 
 

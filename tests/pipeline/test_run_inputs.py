@@ -14,9 +14,9 @@ from nolbo_ppl.data.sequences import open_frames
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.odometry import GroundHeight, KnownLengths
 from nolbo_ppl.pipeline.depth_refinement import DepthScale
-from nolbo_ppl.pipeline.perception import DepthPictures, SequenceDepth, StereoPairs, beside, observe_sequence
+from nolbo_ppl.pipeline.perception import DepthImages, SequenceDepth, StereoPairs, beside, observe_sequence
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_inputs import lengths_between, open_drive, scale_of
+from nolbo_ppl.pipeline.run_inputs import lengths_between, open_run_inputs, scale_of
 from nolbo_ppl.structures.detections import Detections
 from tests.simulated_sequence import CAMERA, SimulatedDrive
 
@@ -35,7 +35,7 @@ def test_where_lengths_come_from(drive: SimulatedDrive, tmp_path: Path) -> None:
             **change,
         }
         config = RunConfig(**values)
-        return scale_of(open_drive(config), config)
+        return scale_of(open_run_inputs(config), config)
 
     by_wheel = scale(wheel=tmp_path / "wheel.txt", truth=folder / "truth.txt")
     assert isinstance(by_wheel, KnownLengths)
@@ -81,7 +81,7 @@ def test_depth_sharpens_what_is_written(drive: SimulatedDrive, tmp_path: Path) -
         return observe_sequence(observe, read, names, CAMERA, depth, 2, [0.0, 0.5, 1.0])
 
     plain = seen(SequenceDepth(frames, busiest))  # plain images bring no depth
-    sharp = seen(DepthPictures([tmp_path / name for name in names], DepthScale(unit=1 / 5000)))
+    sharp = seen(DepthImages([tmp_path / name for name in names], DepthScale(unit=1 / 5000)))
     assert plain.id == sharp.id and set(plain.image) <= set(names) and set(plain.time) <= {0.0, 0.5, 1.0}
     moved = (plain.position != sharp.position).any(axis=1)
     np.testing.assert_array_equal(plain.position_covariance[~moved], sharp.position_covariance[~moved])
@@ -91,7 +91,7 @@ def test_depth_sharpens_what_is_written(drive: SimulatedDrive, tmp_path: Path) -
         turned = np.linalg.norm(np.cross(before, after)) / np.dot(after, after)
         assert turned < 0.02  # along the ray, but for what correlates with it
     assert 0 < moved.sum() < len(plain)
-    known = seen(DepthPictures([None, None, None], DepthScale()))
+    known = seen(DepthImages([None, None, None], DepthScale()))
     np.testing.assert_array_equal(known.position, plain.position)
 
 

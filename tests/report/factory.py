@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nolbo_ppl.cli.slam import SlamArguments, run
+from nolbo_ppl.cli.slam import SlamRunConfig, run
 from nolbo_ppl.data.simulate import (
     R_WORLD_UPRIGHT,
     DetectorConfig,
@@ -68,7 +68,7 @@ def make_slam(folder: Path) -> Path:
     write_trajectory(folder / "odometry.txt", Trajectory(made.odometry))
     write_trajectory(folder / "truth.txt", Trajectory(made.truth))
     write_observations(folder / "observations.jsonl", made.observations)
-    run(SlamArguments(folder / "odometry.txt", folder / "observations.jsonl", folder / "slam", truth=folder / "truth.txt"))
+    run(SlamRunConfig(folder / "odometry.txt", folder / "observations.jsonl", folder / "slam", truth=folder / "truth.txt"))
     return folder / "slam"
 
 
@@ -122,7 +122,7 @@ def make_run(folder: Path) -> Path:
             "before": slam["before"],
             "after": slam["after"],
             "oracle": {"ate": 0.9 * slam["after"]["ate"]},
-            "observation_figures": {
+            "observation_scores": {
                 "recall": 0.91,
                 "position_error": {"all": {"median": 0.2, "p90": 0.5}, "0-5 m": {"median": 0.1}},
             },

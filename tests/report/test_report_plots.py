@@ -22,7 +22,7 @@ from nolbo_ppl.report.sections import world_map
 from nolbo_ppl.report.shape_thumbnails import render_shape
 from nolbo_ppl.report.svg import Axes, element, equal_axes, round_ticks
 from nolbo_ppl.report.viewer_objects import ellipsoid
-from nolbo_ppl.report.wording import figures_tables, say
+from nolbo_ppl.report.wording import say, score_tables
 from nolbo_ppl.structures.association_table import AssociationTable
 
 
@@ -146,7 +146,7 @@ def test_markup_cannot_leave_attributes_tables_or_data() -> None:
     evil = "\"'></script><img src=x onerror=alert(1)>&lt;"
     assert Elements(element("g", data_tip=evil)).found == [("g", {"data-tip": evil})]
     tables = "".join(
-        t for _, t in figures_tables({evil: {evil: 1.0}, "b": {"x": {evil: 1}, "y": {evil: evil}}, "warnings": [evil]})
+        t for _, t in score_tables({evil: {evil: 1.0}, "b": {"x": {evil: 1}, "y": {evil: evil}}, "warnings": [evil]})
     )
     assert {tag for tag, _ in Elements(tables).found} <= {"div", "table", "thead", "tbody", "tr", "th", "td"}
     assert [tag for tag, _ in Elements(json_script([evil])).found] == ["script"]

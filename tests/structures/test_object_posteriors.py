@@ -117,7 +117,9 @@ def test_detections_are_what_a_file_of_them_holds(tmp_path: Path) -> None:
 
 def test_rows_carry_the_whole_posterior() -> None:
     seen = observations()
-    first, second = seen.rows(7, "000007.png")
+    first, second = seen.to_records(7, "000007.png")
+    with pytest.warns(FutureWarning, match="rows is now to_records"):
+        assert list(seen.rows(7, "000007.png")) == [first, second]
     assert first["frame"] == 7 and first["id"] == "000007-000" and first["image"] == "000007.png"
     assert first["category"] == "car" and first["class_posterior"] == {"bottle": 0.2, "car": 0.8}
     assert second["objectness"] == 0.4 and second["latent_std"] == [0.3, 0.4]

@@ -19,18 +19,18 @@ from nolbo_ppl.io.files import read_jsonl
 from nolbo_ppl.synthetic import dataset_writer as dataset
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import standard
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 COUNT = 10
 
 
 @pytest.fixture(scope="module")
-def source() -> SceneSource:
-    return SceneSource(standard(64), seed=11, instances=2)
+def source() -> SceneGenerator:
+    return SceneGenerator(standard(64), seed=11, instances=2)
 
 
 @pytest.fixture(scope="module")
-def written(source: SceneSource, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(source: SceneGenerator, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("scenes") / "set"
     summary = write_scenes(out, source, COUNT)
     assert summary["scenes"] == COUNT
@@ -43,7 +43,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(files)}
 
 
-def test_round_trip(source: SceneSource, written: Path) -> None:
+def test_round_trip(source: SceneGenerator, written: Path) -> None:
     folder = SceneFolder(written, size=64)
     assert len(folder) == COUNT and folder.slots == 8
     batch = folder.batch(range(COUNT))
@@ -74,19 +74,19 @@ def test_round_trip(source: SceneSource, written: Path) -> None:
     assert packed.shape == (len(folder.instances), 4096)
 
 
-def test_killed_run_is_resumed(source: SceneSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_run_is_resumed(source: SceneGenerator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dataset, "CHUNK", 3)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     write_scenes(whole, source, 8)
-    render = SceneSource.render
+    render = SceneGenerator.render
 
-    def dying(self: SceneSource, index: int):
+    def dying(self: SceneGenerator, index: int):
         if index == 5:
             raise KeyboardInterrupt
         return render(self, index)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SceneSource, "render", dying)
+        patch.setattr(SceneGenerator, "render", dying)
         with pytest.raises(KeyboardInterrupt):
             write_scenes(killed, source, 8)
     assert not (killed / "scenes.jsonl").exists()
@@ -94,11 +94,11 @@ def test_killed_run_is_resumed(source: SceneSource, tmp_path: Path, monkeypatch:
         SceneFolder(killed)
     drawn: list[int] = []
 
-    def counting(self: SceneSource, index: int):
+    def counting(self: SceneGenerator, index: int):
         drawn.append(index)
         return render(self, index)
 
-    monkeypatch.setattr(SceneSource, "render", counting)
+    monkeypatch.setattr(SceneGenerator, "render", counting)
     write_scenes(killed, source, 8)
     assert drawn == [3, 4, 5, 6, 7]  # the finished chunk is not made again
     assert contents(killed) == contents(whole)
@@ -111,14 +111,14 @@ def test_killed_run_is_resumed(source: SceneSource, tmp_path: Path, monkeypatch:
 
 @pytest.mark.slow
 def test_files_do_not_depend_on_the_number_of_workers(
-    source: SceneSource, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    source: SceneGenerator, written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dataset, "CHUNK", 4)
     write_scenes(tmp_path / "two", source, COUNT, workers=2)
     assert contents(tmp_path / "two") == contents(written)
 
 
-def test_other_scenes_are_not_mixed_in(source: SceneSource, written: Path, tmp_path: Path) -> None:
+def test_other_scenes_are_not_mixed_in(source: SceneGenerator, written: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"the folder holds other scenes.*choose another --out"):
         write_scenes(written, replace(source, seed=12), COUNT)
     (tmp_path / "notes.txt").write_text("mine")

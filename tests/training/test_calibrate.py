@@ -95,7 +95,7 @@ def test_distorted_scales_and_odds_are_found(monkeypatch: pytest.MonkeyPatch) ->
         position=position,
         diagonal=diagonal,
         symmetry=torch.ones_like(batch.symmetry),
-        shape_loc=scattered(q.at_mode(model.story.prior.label_mean()).shape_loc, q.shape_scale, 1.2),
+        shape_loc=scattered(q.at_map_category(model.story.prior.label_mean()).shape_loc, q.shape_scale, 1.2),
     )
     # turns of the in-plane angle by whole circles are no errors
     batch.viewpoint[::2, :, 2] += 2 * math.pi

@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, SHAPE_STAGE, SceneELBO
-from nolbo_ppl.inference.svi import OptimisationConfig, restore, state_tensors
+from nolbo_ppl.inference.svi import OptimizerConfig, restore, state_tensors
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.training.stages import OBJECTIVES, StageRun, TrainingStage, scene_weights, seeded_noise, shorten
-from nolbo_ppl.training.validation import held_out
+from nolbo_ppl.training.validation import validate
 from tests.factories import random_batch, run_in_two_processes, tiny_config, tiny_model
 from tests.gloo_worker import local_batch, local_run, training
 
-QUICK = OptimisationConfig(steps=4, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
+QUICK = OptimizerConfig(steps=4, learning_rate=1e-2, warmup=1, decay=0.0, ema=0.5)
 
 
 def snapshot(model: Nolbo) -> dict[str, torch.Tensor]:
@@ -40,7 +40,7 @@ def test_frozen_parts_stay_bit_identical() -> None:
         run.step(random_batch(config, seed=step))
         changed = moved(before, model)
         if step < 2:
-            held_out(model, [random_batch(config, seed=9)])
+            validate(model, [random_batch(config, seed=9)])
             assert all(name.startswith("guide.") for name in changed)
             frozen = {n: v for n, v in run.state.average.items() if not n.startswith("guide.")}
             assert all(torch.equal(value, before[name]) for name, value in frozen.items())
@@ -81,7 +81,7 @@ def test_the_label_of_a_shape_latent_by_bayes() -> None:
     model = tiny_model().eval()
     scene = random_batch(tiny_config(), 1, 4)
     batch = ShapeBatch(scene.voxels[0], scene.category[0], scene.instance[0], scene.noise[0])
-    terms = SceneELBO(SHAPE_STAGE).terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
+    terms = SceneELBO(SHAPE_STAGE).terms(model.shape_model, model.shape_guide, batch, names={"shape_label"})
     loc, scale = model.shape_guide.posterior(batch.voxels)
     z, mean = loc + scale * batch.noise, model.story.prior.category_mean()
     density = torch.distributions.MultivariateNormal(mean, torch.eye(mean.shape[1])).log_prob(z[:, None]).exp()
@@ -102,7 +102,7 @@ def test_the_label_of_a_shape_latent_keeps_categories_apart() -> None:
             run.step(batch)
         model.eval()
         elbo = SceneELBO(SHAPE_STAGE)
-        terms = elbo.terms(model.shape_story, model.shape_guide, batch, names={"shape_label"})
+        terms = elbo.terms(model.shape_model, model.shape_guide, batch, names={"shape_label"})
         certain[weight] = float(terms["shape_label"].detach())
     assert certain[50.0] > certain[0.0] + 0.1, certain
 
@@ -112,7 +112,7 @@ def test_every_objective_learns(objective: str) -> None:
     """One scene, a few steps: the loss falls."""
     config = tiny_config()
     model = tiny_model(config)
-    longer = OptimisationConfig(steps=12, learning_rate=5e-3, warmup=1, decay=0.0, ema=0.5)
+    longer = OptimizerConfig(steps=12, learning_rate=5e-3, warmup=1, decay=0.0, ema=0.5)
     run = StageRun(model, TrainingStage("scenes", longer, scene_weights(objective, {"voxels": 0.0})))
     batch = random_batch(config, 1, 2)
     losses = [run.step(batch).loss for _ in range(12)]
@@ -127,7 +127,7 @@ def test_the_average_is_adopted() -> None:
         run.step(random_batch(config, seed=step))
     copy = run.averaged()
     assert not copy.training
-    run.adopt_average()
+    run.load_ema()
     for (name, ours), averaged in zip(model.state_dict().items(), copy.state_dict().values(), strict=True):
         assert torch.equal(ours, averaged), name
 
@@ -140,7 +140,7 @@ def test_weights_of_objectives() -> None:
 
 
 def test_shorter_stages_freeze_in_proportion() -> None:
-    stage = shorten(TrainingStage("scenes", OptimisationConfig(steps=1000), INCLUSIVE, freeze=400), 100)
+    stage = shorten(TrainingStage("scenes", OptimizerConfig(steps=1000), INCLUSIVE, freeze=400), 100)
     assert (stage.optimisation.steps, stage.freeze) == (100, 40)
 
 

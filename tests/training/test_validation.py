@@ -14,7 +14,7 @@ from nolbo_ppl.geometry.rotation import viewpoint_to_matrix
 from nolbo_ppl.inference.elbo import INCLUSIVE, SceneELBO
 from nolbo_ppl.models.guide import orientation_posterior
 from nolbo_ppl.models.scene_batch import decode_box
-from nolbo_ppl.training.validation import held_out
+from nolbo_ppl.training.validation import validate
 from tests.factories import random_batch, tiny_config, tiny_model
 
 
@@ -32,7 +32,7 @@ def test_figures_by_hand(form: str) -> None:
         own = decode_box(scene.posterior.box_loc, scene.assignment.cell, 4, config)
         batches[0].box[1, 1] = own[1, 1]
     model.train()
-    figures = held_out(model, batches)
+    figures = validate(model, batches)
     model.eval()
     overlap, category, errors, inside = [], [], [], []
     bound, inclusive = {}, {}
@@ -89,12 +89,12 @@ def test_modes_are_left_as_they_were() -> None:
     model.story.eval()
     before = {name: module.training for name, module in model.named_modules()}
     state = {name: value.clone() for name, value in model.state_dict().items()}
-    held_out(model, [random_batch(tiny_config())])
+    validate(model, [random_batch(tiny_config())])
     assert {name: module.training for name, module in model.named_modules()} == before
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
 
 
 def test_nothing_to_look_at() -> None:
-    figures = held_out(tiny_model(), [random_batch(tiny_config(), objects=0)])
+    figures = validate(tiny_model(), [random_batch(tiny_config(), objects=0)])
     assert "box50" not in figures
     assert math.isfinite(figures["bound"])

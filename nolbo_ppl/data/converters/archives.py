@@ -25,7 +25,7 @@ from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
 
 FIELD_OF_VIEW = float(np.radians(60.0))
 """Horizontal view of a camera that nobody states. Nothing is learnt from it: such objects have no position."""
-LEAST_SIDE = 2.0
+MIN_SIDE = 2.0
 """Boxes with a side below, px, are left out: they hold nothing to see."""
 
 
@@ -101,7 +101,7 @@ def scene_line(image: ArchiveImage, name: str, benchmark: bool = False) -> dict[
     objects, ignore = [], []
     for thing in image.objects:
         box = np.clip(np.array(thing.box, dtype=np.float64), 0, limit)
-        if (box[2:] - box[:2] < LEAST_SIDE).any():
+        if (box[2:] - box[:2] < MIN_SIDE).any():
             continue
         if thing.difficult or (benchmark and (thing.truncated or thing.occluded)):
             ignore.append(box.tolist())

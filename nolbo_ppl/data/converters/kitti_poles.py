@@ -12,7 +12,7 @@ from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.data.simulate import DetectorConfig, SimulatedWorld, simulate_detections
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.npz import read_npy
-from nolbo_ppl.io.observations import make_table
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
 
 
@@ -72,7 +72,7 @@ def convert_kitti_poles(
     )
     objects = SimulatedWorld(world, np.tile(np.eye(3), (m, 1, 1)), np.zeros(m, np.int64), np.zeros((m, 0)), np.zeros((1, 0)))
     table, source = simulate_detections(truth, objects, detector, np.random.default_rng(seed))
-    plain = make_table(
+    plain = Detections.from_arrays(
         table.frame, table.position, position_covariance=table.position_covariance, category=["pole"] * len(table), id=table.id
     )
     poses = {f"pole-{j}": np.block([[np.eye(3), world[j][:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]) for j in range(m)}

@@ -14,7 +14,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 from nolbo_ppl.io.files import read_text
 from nolbo_ppl.io.npz import read_npz
-from nolbo_ppl.io.observations import make_table
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory
 
 
@@ -144,7 +144,7 @@ def convert_kitti_tracking(
     position = np.stack([rows[:, 10], rows[:, 11] - h / 2, rows[:, 12]], axis=1)
     objectness = 1.0 / (1.0 + np.exp(-rows[:, 6]))
     counter = np.array([int(np.sum(frame[:i] == t)) for i, t in enumerate(frame)]) if len(frame) else frame
-    table = make_table(
+    table = Detections.from_arrays(
         frame,
         position,
         rotation=car_rotation(rows[:, 13]),

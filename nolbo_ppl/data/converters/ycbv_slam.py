@@ -11,7 +11,7 @@ from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import chain, make_pose, nearest_rotation, quaternion_to_matrix, relative, se3_exp, so3_log
 from nolbo_ppl.io.npz import Npz
-from nolbo_ppl.io.observations import make_table
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory
 
 
@@ -94,7 +94,7 @@ def convert_ycbv_slam(
     T = np.concatenate(poses)[order]
     labels = [labels[i] for i in order]
     frame = frame[order]
-    table = make_table(
+    table = Detections.from_arrays(
         frame, T[:, :3, 3], rotation=T[:, :3, :3], category=labels, id=[f"{t:06d}-{name}" for t, name in zip(frame, labels)]
     )
     settings = {

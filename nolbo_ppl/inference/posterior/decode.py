@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
-from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer
+from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape
 from nolbo_ppl.models.distributions import VonMisesMixture, kl_to_each_component
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
@@ -44,7 +44,7 @@ def assemble(
     config: ModelConfig,
     prior: LabelPrior,
     prior_mean: Float[Tensor, "labels d"],
-    shapes: Callable[[RegionParameters, Float[Tensor, " n"]], ShapeAnswer],
+    shapes: Callable[[RegionParameters, Float[Tensor, " n"]], DecodedShape],
 ) -> ObjectPosteriors:
     """Everything the posterior of some regions says.
 
@@ -57,7 +57,7 @@ def assemble(
     """
     q, camera, scale = regions.q, regions.camera, regions.scale
     box = decode_box(q.box_loc, regions.number // config.predictors, regions.columns, config)
-    box_scale = box_scales(q, config)
+    box_scale = box_sigmas(q, config)
     position, diagonal = decode_range(q.range_loc, box, camera, config)
     azimuth = VonMisesMixture(
         q.azimuth_logits, q.azimuth_natural, max_concentration=config.max_concentration, validate_args=False
@@ -95,7 +95,7 @@ def assemble(
     )
 
 
-def box_scales(q: RegionParameters, config: ModelConfig) -> Float[Tensor, "n 4"]:
+def box_sigmas(q: RegionParameters, config: ModelConfig) -> Float[Tensor, "n 4"]:
     """Scales of each box's centre, px of the scaled image, and of its log extents."""
     scale = q.box_scale * q.box_scale.new_tensor(config.box_spread)
     return torch.cat((scale[:, :2] * config.stride, scale[:, 2:]), -1)

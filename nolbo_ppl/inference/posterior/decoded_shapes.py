@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 
 Decoder = Callable[[Float[Tensor, "n d"]], Float[Tensor, "n v v v"]]
@@ -18,7 +19,7 @@ AT_ONCE = 64
 """Shapes decoded at once: all samples of all objects would not fit the cache."""
 
 
-class ShapeAnswer(NamedTuple):
+class DecodedShape(NamedTuple):
     """Shapes of n objects."""
 
     mean: Float[np.ndarray, "n v v v"] | None
@@ -42,7 +43,7 @@ def sampled_shapes(
     diagonal: Float[np.ndarray, " n"],
     samples: int,
     seed: int,
-) -> ShapeAnswer:
+) -> DecodedShape:
     """Mean and variance of the voxels over `N(loc, scale^2)`, and extents of the shape at `loc`.
 
     Args:
@@ -73,7 +74,7 @@ def sampled_shapes(
         squares = (decoded[1:] - middle).square_().sum(0)  # torch.var_mean takes 20 times as long here
         mean[part], variance[part] = middle.numpy(), (squares / (samples - 1)).numpy()
         size[part] = extents(decoded[0].numpy()) * diagonal[part][:, None]
-    return ShapeAnswer(mean, variance, size)
+    return DecodedShape(mean, variance, size)
 
 
 def extents(occupancy: Float[np.ndarray, "n v v v"]) -> Float[np.ndarray, "n 3"]:
@@ -85,3 +86,7 @@ def extents(occupancy: Float[np.ndarray, "n v v v"]) -> Float[np.ndarray, "n 3"]
             used = np.flatnonzero(grid.any(axis=tuple({0, 1, 2} - {axis})))
             result[i, axis] = (used[-1] - used[0] + 1) / n if len(used) else 3**-0.5
     return result / np.linalg.norm(result, axis=1, keepdims=True)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -15,9 +15,9 @@ from torch import Tensor
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import boxes_in_image, suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
-from nolbo_ppl.inference.posterior.decoded_shapes import ShapeAnswer, decode_latents, extents, sampled_shapes
+from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape, decode_latents, extents, sampled_shapes
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
-from nolbo_ppl.inference.posterior.preprocess import Prepared, prepare_all, same_shape
+from nolbo_ppl.inference.posterior.preprocess import PreprocessedImage, preprocess_all, same_shape
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guessed_intrinsics
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import Encoding, RegionParameters
@@ -112,7 +112,7 @@ class ObservationModel:
         """
         single = (isinstance(images, np.ndarray) and images.ndim == 3) or (isinstance(images, Tensor) and images.dim() == 3)
         sequence: list[Any] = [images] if single else list(images)  # type: ignore[list-item]
-        prepared = self._prepare_all(sequence, intrinsics, size)
+        prepared = self._preprocess_all(sequence, intrinsics, size)
         if not 0 < threshold < 1:
             raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
 
@@ -145,7 +145,7 @@ class ObservationModel:
         """
         if len(boxes) != len(images):
             raise input_error("boxes", got=f"{len(boxes)} lists", expected=f"one list for each of {len(images)} images")
-        prepared = self._prepare_all(images, intrinsics, size)
+        prepared = self._preprocess_all(images, intrinsics, size)
         checked = []
         for i, (image, given) in enumerate(zip(prepared, boxes)):
             height, width = image.image.shape[-2:]
@@ -168,7 +168,7 @@ class ObservationModel:
     @torch.inference_mode()
     def _observe(
         self,
-        prepared: list[Prepared],
+        prepared: list[PreprocessedImage],
         find: Callable[[Encoding, Tensor, list[int]], Found],
         decode: bool,
         samples: int,
@@ -177,10 +177,10 @@ class ObservationModel:
     ) -> list[ObjectPosteriors]:
         """Run batches of images of one shape; `find` gives what to answer for."""
 
-        def shapes(q: RegionParameters, diagonal: Tensor) -> ShapeAnswer:
+        def shapes(q: RegionParameters, diagonal: Tensor) -> DecodedShape:
             metres = diagonal.numpy()
             if not decode:
-                return ShapeAnswer(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
+                return DecodedShape(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
             story, side = self.model.story, self.config.voxel_size
             return sampled_shapes(story.decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
 
@@ -200,14 +200,14 @@ class ObservationModel:
                 results[i] = answer[slice(ends[k], ends[k + 1])]
         return [results[i] for i in range(len(prepared))]
 
-    def _prepare_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[Prepared]:
-        return prepare_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
+    def _preprocess_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[PreprocessedImage]:
+        return preprocess_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
 
     def _parameters(
         self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
     ) -> RegionParameters:
         q = self.model.guide.parameters_at(encoding, row, region, box=box)
-        return self.calibration.apply(q.at_mode(self._prior_mean))
+        return self.calibration.apply(q.at_map_category(self._prior_mean))
 
     def _boxes(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> Float[Tensor, "n 4"]:
         """Boxes of regions, px of the scaled image; no second look is needed for them."""

@@ -5,25 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 
 Image = UInt8[np.ndarray, "h w 3"] | UInt8[Tensor, "3 h w"]
 """An image: a uint8 array of height x width x 3 colours, or a torch tensor with the colours first."""
 PADDING = 114
 """Grey value of the bars beside an image."""
-LEAST_SIDE = 8
+MIN_SIDE = 8
 """Least height and width of an image, px."""
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreprocessedImage:
     """An image as the network takes it."""
 
     image: UInt8[Tensor, "3 h w"]
@@ -41,7 +42,7 @@ def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "
     return np.array([focal, focal, width / 2, height / 2])
 
 
-def prepare(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> Prepared:
+def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> PreprocessedImage:
     """Scale an image uniformly so that its longer side has the wanted size; grey bars make both multiples of 32.
 
     The rule of training (`nolbo_ppl.data.folder.letterbox`), with bars on the right and below, so that pixels keep their place.
@@ -61,8 +62,8 @@ def prepare(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.f
         got = (getattr(image, "shape", type(image).__name__), getattr(image, "dtype", ""))
         raise input_error("an image", got=got, expected="a uint8 array of shape (height, width, 3)")
     height, width = image.shape[:2]
-    if min(height, width) < LEAST_SIDE:
-        raise input_error("an image", got=f"{width} x {height} px", expected=f"at least {LEAST_SIDE} x {LEAST_SIDE} px")
+    if min(height, width) < MIN_SIDE:
+        raise input_error("an image", got=f"{width} x {height} px", expected=f"at least {MIN_SIDE} x {MIN_SIDE} px")
     if intrinsics is None:
         camera = guessed_intrinsics(image)
     else:
@@ -80,19 +81,21 @@ def prepare(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.f
     if any(bars):
         image = np.pad(image, ((0, bars[1]), (0, bars[0]), (0, 0)), constant_values=PADDING)
     tensor = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
-    return Prepared(tensor, torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype), scale)
+    return PreprocessedImage(tensor, torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype), scale)
 
 
-def prepare_all(images: Sequence[Any], intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> list[Prepared]:
-    """Images of any shapes, with intrinsics [4] for all or [n, 4], a row an image; see `prepare`.
+def preprocess_all(
+    images: Sequence[Any], intrinsics: Any, size: int, dtype: torch.dtype = torch.float32
+) -> list[PreprocessedImage]:
+    """Images of any shapes, with intrinsics [4] for all or [n, 4], a row an image; see `preprocess`.
 
     Raises:
-        InputError: a size that is no positive multiple of 32, another number of intrinsics than of images, or what `prepare`
+        InputError: a size that is no positive multiple of 32, another number of intrinsics than of images, or what `preprocess`
             refuses.
     """
     if size <= 0 or size % 32:
         raise input_error("size of the scaled images", got=size, expected="a positive multiple of 32")
-    return [prepare(image, intrinsics_of(intrinsics, i, len(images)), size, dtype) for i, image in enumerate(images)]
+    return [preprocess(image, intrinsics_of(intrinsics, i, len(images)), size, dtype) for i, image in enumerate(images)]
 
 
 def intrinsics_of(intrinsics: Any, index: int, count: int) -> Any:
@@ -111,7 +114,7 @@ def intrinsics_of(intrinsics: Any, index: int, count: int) -> Any:
     return values[index]
 
 
-def same_shape(prepared: Sequence[Prepared], batch: int) -> list[list[int]]:
+def same_shape(prepared: Sequence[PreprocessedImage], batch: int) -> list[list[int]]:
     """Groups of at most `batch` images of one shape, in order, as numbers of the images."""
     groups: dict[tuple[int, ...], list[list[int]]] = {}
     for i, one in enumerate(prepared):
@@ -120,3 +123,7 @@ def same_shape(prepared: Sequence[Prepared], batch: int) -> list[list[int]]:
             of_shape.append([])
         of_shape[-1].append(i)
     return [group for of_shape in groups.values() for group in of_shape]
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

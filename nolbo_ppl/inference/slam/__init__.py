@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.em import EmStepInfo, step
-from nolbo_ppl.inference.slam.graph import GraphError, Links
+from nolbo_ppl.inference.slam.graph import GraphError, LandmarkEqualities
 from nolbo_ppl.inference.slam.ground_truth_association import solve_with_associations
+from nolbo_ppl.inference.slam.incremental.incremental_slam import IncrementalInfo, IncrementalSlam, solve_incremental
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
-from nolbo_ppl.inference.slam.incremental.online_slam import IncrementalSlam, OnlineInfo, solve_online
 from nolbo_ppl.inference.slam.initialise import SlamState, init
 from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
-from nolbo_ppl.inference.slam.reference_em import PlainInfo, PlainState, plain_init, plain_solve, plain_step
+from nolbo_ppl.inference.slam.reference_em import ReferenceEmInfo, ReferenceEmState, em_init, em_solve, em_step
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import iterate, solve
@@ -23,13 +25,13 @@ __all__ = [
     "Associations",
     "GraphError",
     "Landmark",
-    "Links",
+    "LandmarkEqualities",
     "NoiseModel",
     "IncrementalSlam",
     "KeyframeConfig",
-    "OnlineInfo",
-    "PlainInfo",
-    "PlainState",
+    "IncrementalInfo",
+    "ReferenceEmInfo",
+    "ReferenceEmState",
     "SlamConfig",
     "SlamProblem",
     "SlamResult",
@@ -40,14 +42,15 @@ __all__ = [
     "finish",
     "init",
     "iterate",
-    "plain_init",
-    "plain_solve",
-    "plain_step",
+    "em_init",
+    "em_solve",
+    "em_step",
     "solve",
-    "solve_online",
+    "solve_incremental",
     "solve_with_associations",
     "step",
 ]
 
 
-__getattr__ = renamed(__name__, {"ObjectSlam": "IncrementalSlam", "StepInfo": "EmStepInfo"})
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

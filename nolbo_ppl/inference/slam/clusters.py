@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int
 
-from nolbo_ppl.inference.slam.graph import Links
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 
@@ -17,7 +17,7 @@ def frames_of_landmarks(state: SlamState) -> list[frozenset[int]]:
     return [frozenset(f) for f in frames]
 
 
-def join(links: Links, frames: list[frozenset[int]], minimum: float) -> Int[np.ndarray, " m"]:
+def join(links: LandmarkEqualities, frames: list[frozenset[int]], minimum: float) -> Int[np.ndarray, " m"]:
     """Cluster of every landmark, numbered by its earliest member: links above `minimum`, strongest first.
 
     A link that would put two tracklets of one frame together is passed over.

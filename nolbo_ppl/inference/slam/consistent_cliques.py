@@ -109,7 +109,7 @@ def promising_nodes(together: Bool[np.ndarray, "p p"], minimum: int) -> Int[np.n
     return np.array(sorted(chosen), dtype=np.int64)
 
 
-def find_closing(
+def find_loop_closure(
     pairs: Pairs,
     estimate: SlamEstimate,
     samples: PosteriorSamples,
@@ -192,7 +192,9 @@ def close_constellations(
         rows = np.concatenate([order[s:e] for s, e in zip(low, high)]) if len(member) else np.zeros(0, int)
         # Pairs within the window itself are short-term matters, left to the soft E-step.
         rows = rows[~np.isin(pairs.b[rows], member)]
-        closing = find_closing(pairs.select(rows), estimate, samples, config, inflation=inflation, floor=floor, log_new=log_new)
+        closing = find_loop_closure(
+            pairs.select(rows), estimate, samples, config, inflation=inflation, floor=floor, log_new=log_new
+        )
         if closing and closing.log_odds > config.constellation_log_odds and closing.margin > config.constellation_log_odds / 2:
             found.append(closing)
     found.sort(key=lambda closing: -closing.log_odds)

@@ -45,7 +45,7 @@ class FeaturePrior:
         ratio = np.where(a == b, np.log((1 - error) / frequency + error), np.log(error))
         return np.where((a < 0) | (b < 0), 0.0, ratio)
 
-    def pair_log_ratio(
+    def log_likelihood_ratio(
         self,
         latent_a: np.ndarray,
         variance_a: np.ndarray,

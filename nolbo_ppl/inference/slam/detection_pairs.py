@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from nolbo_ppl.geometry.pose import inverse, skew, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, weighted_latents
 from nolbo_ppl.inference.slam.gaussian import log_normal, squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, widened
+from nolbo_ppl.inference.slam.graph import Linearisation, inflated
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
@@ -173,7 +173,7 @@ def _without_own(
     if not len(own):
         return prediction, S
     k = row[own]
-    R = widened(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor) / member[own, None, None]
+    R = inflated(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor) / member[own, None, None]
     root = np.linalg.cholesky(R)
     inverse_root = np.linalg.inv(root)
     leverage, axes = np.linalg.eigh(inverse_root @ relative[own] @ np.swapaxes(inverse_root, 1, 2))
@@ -209,7 +209,7 @@ def feature_log_ratio(
         views = np.maximum(variance[own] / raw_variance[j] - (config.latent_correlation or 0.0) * known, 1.0)
         mean[own] = np.where(some, total / np.where(some, precision, 1.0), mean[own])
         variance[own] = np.where(some, views / np.where(some, precision, 1.0), LARGE_VARIANCE)
-    value = state.prior.pair_log_ratio(
+    value = state.prior.log_likelihood_ratio(
         seen.latent[row], seen.latent_variance[row], seen.category[row], mean, variance, features.category[landmark]
     )
     both = np.flatnonzero(seen.oriented[row] & features.oriented[landmark])

@@ -17,7 +17,13 @@ from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.clusters import clusters_of
 from nolbo_ppl.inference.slam.consistent_cliques import close_constellations
-from nolbo_ppl.inference.slam.graph import LOOSE_ROTATION, Links, add_links, linearise, optimise
+from nolbo_ppl.inference.slam.graph import (
+    UNINFORMATIVE_ROTATION_SIGMA,
+    LandmarkEqualities,
+    add_landmark_equalities,
+    linearise,
+    optimize,
+)
 from nolbo_ppl.inference.slam.initialise import base_graph, inlier_weights
 from nolbo_ppl.inference.slam.loop_candidates import Pairs, TrackletFeatures, candidate_pairs, posterior_samples
 from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
@@ -44,9 +50,9 @@ class EmStepInfo:
     closings: int
     """Constellations accepted."""
     links: int
-    """Links in the M-step."""
+    """LandmarkEqualities in the M-step."""
     strong_links: int
-    """Links that merge tracklets."""
+    """LandmarkEqualities that merge tracklets."""
     change: float
     """Root mean square change of the camera positions, m."""
     graph_error: float
@@ -60,10 +66,10 @@ def link_arrays(
     b: Int[np.ndarray, " l"],
     weight: Float[np.ndarray, " l"],
     position_scale: float,
-) -> Links:
-    """Links between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
+) -> LandmarkEqualities:
+    """LandmarkEqualities between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
     T = np.tile(np.eye(4), (len(a), 1, 1))
-    scale = np.tile([LOOSE_ROTATION, position_scale], (len(a), 1))
+    scale = np.tile([UNINFORMATIVE_ROTATION_SIGMA, position_scale], (len(a), 1))
     both = np.flatnonzero(features.oriented[a] & features.oriented[b] & (features.symmetry[a] != 0) & (features.symmetry[b] != 0))
     if len(both):
         i, j = a[both], b[both]
@@ -72,11 +78,13 @@ def link_arrays(
         T[both] = make_pose(np.swapaxes(turned, 1, 2) @ R[j], np.zeros(3))
         scale[both, 0] = LINK_ROTATION
         error = np.arccos(np.clip((np.einsum("lij,lij->l", R[i], turned) - 1) / 2, -1, 1))
-        scale[both[error > CONTRADICTION], 0] = LOOSE_ROTATION
-    return Links(a, b, weight, T, scale)
+        scale[both[error > CONTRADICTION], 0] = UNINFORMATIVE_ROTATION_SIGMA
+    return LandmarkEqualities(a, b, weight, T, scale)
 
 
-def make_links(state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"], weight: np.ndarray) -> Links:
+def make_landmark_equalities(
+    state: SlamState, a: Int[np.ndarray, " l"], b: Int[np.ndarray, " l"], weight: np.ndarray
+) -> LandmarkEqualities:
     """`link_arrays` of a state."""
     return link_arrays(state.estimate.T_world_landmark[:, :3, :3], state.features, a, b, weight, state.link_scale)
 
@@ -133,12 +141,12 @@ def soft_assignment(
     return np.concatenate(a_out), np.concatenate(b_out), np.minimum(np.concatenate(w_out), 1.0), evidence
 
 
-def soft_links(state: SlamState, pairs: Pairs) -> tuple[Links, float]:
+def soft_landmark_equalities(state: SlamState, pairs: Pairs) -> tuple[LandmarkEqualities, float]:
     """The E-step of a state as links, and its log evidence."""
     a, b, weight, evidence = soft_assignment(
         pairs, state.features, clusters_of(state), object_log_density(state.noise), state.config
     )
-    return make_links(state, a, b, weight), evidence
+    return make_landmark_equalities(state, a, b, weight), evidence
 
 
 def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
@@ -153,7 +161,7 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
     rng = np.random.default_rng([config.seed, state.iteration])
     graph = base_graph(state)
     linked = graph.clone()
-    add_links(linked, state.links, config.robust_width)
+    add_landmark_equalities(linked, state.links, config.robust_width)
     linearisation = linearise(linked, state.estimate)
     if state.iteration and state.iteration % 2 == 0:
         state = refine_odometry(state, linearisation)
@@ -193,16 +201,16 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
         evidence = sum(c.log_odds for c in accepted)
         a = np.array(list(closed.keys()), dtype=np.int64)
         b = np.array(list(closed.values()), dtype=np.int64)
-        links = make_links(state, a, b, np.ones(len(a)))
+        links = make_landmark_equalities(state, a, b, np.ones(len(a)))
         news = len(closed) - len(state.closed)
         # A few more can wait for the soft E-step; the first rounds must anneal.
         few = news <= 0.02 * len(closed) and state.iteration + 1 >= len(config.annealing)
         last_round = not closed or few or state.iteration + 1 >= config.constellation_rounds
         state = replace(state, closed=closed, closing=not last_round)
     else:
-        links, evidence = soft_links(state, pairs)
-    add_links(graph, links, config.robust_width)
-    estimate, _, error = optimise(graph, state.estimate, iterations=25)
+        links, evidence = soft_landmark_equalities(state, pairs)
+    add_landmark_equalities(graph, links, config.robust_width)
+    estimate, _, error = optimize(graph, state.estimate, iterations=25)
     moved = estimate.T_world_camera[:, :3, 3] - state.estimate.T_world_camera[:, :3, 3]
     state = replace(state, estimate=estimate, links=links, iteration=state.iteration + 1, graph_error=error)
     state = replace(state, weight=inlier_weights(state))

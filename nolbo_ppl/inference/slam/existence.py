@@ -12,7 +12,7 @@ from nolbo_ppl.inference.slam.slam_state import SlamState
 
 NO_EVIDENCE = -50.0
 """Log odds of a landmark that no detection speaks for."""
-LEAST_LANDMARKS = 10
+MIN_LANDMARKS = 10
 """Landmarks of three scores or more that a correlation of scores is measured on."""
 
 
@@ -23,7 +23,7 @@ def score_correlation(measurements: Measurements, pairs: DetectionPairs, weight:
     group = np.unique(pairs.landmark[use], return_inverse=True)[1]
     count = np.bincount(group)
     keep = count[group] >= 3
-    if len(np.unique(group[keep])) < LEAST_LANDMARKS:
+    if len(np.unique(group[keep])) < MIN_LANDMARKS:
         return 0.0
     score, group = score[keep], np.unique(group[keep], return_inverse=True)[1]
     count = np.bincount(group).astype(np.float64)

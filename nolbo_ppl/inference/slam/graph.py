@@ -8,6 +8,7 @@ sit in the noise models (scale / sqrt(w)) and are frozen while the graph is solv
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
@@ -15,13 +16,14 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import NolboError
 from nolbo_ppl.geometry.pose import make_pose, relative
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import resolve_modes
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
-LOOSE_ROTATION = 10.0
+UNINFORMATIVE_ROTATION_SIGMA = 10.0
 """Scale of a rotation nobody observed, rad."""
 PRIOR_ROTATION, PRIOR_POSITION_RATIO = 1.0, 1e3
 """Weak prior of each landmark about its first estimate: rad, and the multiple of the typical range in m."""
@@ -62,7 +64,7 @@ class ObservationFactors:
 
 
 @dataclass(frozen=True)
-class Links:
+class LandmarkEqualities:
     """Soft equality of two landmarks."""
 
     a: Int[np.ndarray, " l"]
@@ -77,9 +79,9 @@ class Links:
     """Scales of rotation in rad and of position in m."""
 
     @staticmethod
-    def none() -> Links:
+    def none() -> LandmarkEqualities:
         """No links."""
-        return Links(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 2)))
+        return LandmarkEqualities(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((0, 2)))
 
     def __len__(self) -> int:
         return len(self.a)
@@ -95,7 +97,7 @@ def landmark_key(j: int) -> int:
     return gtsam.symbol("l", int(j))
 
 
-def widened(
+def inflated(
     covariance: Float[np.ndarray, "k 3 3"], position: Float[np.ndarray, "k 3"], across: float, along: float
 ) -> Float[np.ndarray, "k 3 3"]:
     """Covariances of observed positions multiplied by one factor across the ray and another along it."""
@@ -130,9 +132,9 @@ def resolve_observations(
     angular = np.concatenate([np.full(len(plain), np.inf), modes.scale]) * np.sqrt(noise.rotation_factor)
     informative = np.isfinite(angular)
     covariance = np.zeros((len(k), 6, 6))
-    covariance[:, [0, 1, 2], [0, 1, 2]] = (np.where(informative, angular, LOOSE_ROTATION) ** 2)[:, None]
-    covariance[informative & (symmetry[k] == 0), 2, 2] = LOOSE_ROTATION**2
-    S = widened(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor)
+    covariance[:, [0, 1, 2], [0, 1, 2]] = (np.where(informative, angular, UNINFORMATIVE_ROTATION_SIGMA) ** 2)[:, None]
+    covariance[informative & (symmetry[k] == 0), 2, 2] = UNINFORMATIVE_ROTATION_SIGMA**2
+    S = inflated(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor)
     covariance[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ S @ R
     share = np.concatenate([np.ones(len(plain)), modes.responsibility])
     return ObservationFactors(frame[k], landmark[k], make_pose(R, seen.position[k]), covariance, weight[k] * share, k)
@@ -185,13 +187,13 @@ def add_landmark_priors(
     first: int = 0,
 ) -> None:
     """Weak prior on each landmark (numbered from `first`), so that no system is ever indeterminate."""
-    sigmas = np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [PRIOR_POSITION_RATIO * max(typical_range, 1e-3)] * 3)
+    sigmas = np.array([PRIOR_ROTATION * UNINFORMATIVE_ROTATION_SIGMA] * 3 + [PRIOR_POSITION_RATIO * max(typical_range, 1e-3)] * 3)
     model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     for j, T in enumerate(T_world_landmark):
         graph.add(gtsam.PriorFactorPose3(landmark_key(first + j), gtsam.Pose3(T), model))
 
 
-def add_links(graph: gtsam.NonlinearFactorGraph, links: Links, robust_width: float | None) -> None:
+def add_landmark_equalities(graph: gtsam.NonlinearFactorGraph, links: LandmarkEqualities, robust_width: float | None) -> None:
     """Between-factors of linked landmarks, weighted; under a Cauchy kernel when a width is given."""
     for k in range(len(links)):
         sigmas = np.repeat(links.scale[k], 3) / np.sqrt(max(links.weight[k], 1e-12))
@@ -226,7 +228,7 @@ def named_error(error: RuntimeError) -> GraphError:
     return GraphError(f"the factor graph cannot be solved: {text[:300]} (x: pose of that row, l: landmark of that number)")
 
 
-def optimise(
+def optimize(
     graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate, *, iterations: int = 20, relative_tolerance: float = 1e-5
 ) -> tuple[SlamEstimate, float, float]:
     """Levenberg-Marquardt from an estimate; the new one and the error (half squared, whitened) before and after.
@@ -324,3 +326,7 @@ def linearise(graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate) -> Line
     except RuntimeError as error:
         raise GraphError(f"the linearised graph is indeterminate: {error}") from None
     return Linearisation(len(estimate.T_world_landmark), len(estimate.T_world_camera), jacobian, factor, residual)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

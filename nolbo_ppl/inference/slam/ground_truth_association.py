@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam.detection_features import fit_prior
-from nolbo_ppl.inference.slam.graph import Links, optimise
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, optimize
 from nolbo_ppl.inference.slam.initialise import SlamState, base_graph, first_estimate, tracklet_features
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
@@ -61,11 +61,11 @@ def solve_with_associations(
         weight=weight,
         features=features,
         estimate=first_estimate(measurements, problem.odometry, config, rows, landmark, count),
-        links=Links.none(),
+        links=LandmarkEqualities.none(),
         typical_range=float(np.median(np.linalg.norm(problem.observations.position, axis=1))) if len(full) else 1.0,
     )
-    estimate, _, error = optimise(base_graph(state), state.estimate, iterations=100, relative_tolerance=1e-8)
+    estimate, _, error = optimize(base_graph(state), state.estimate, iterations=100, relative_tolerance=1e-8)
     state = replace(state, estimate=estimate, graph_error=error)
     # Once more: orientation modes were resolved against the first estimate.
-    estimate, _, error = optimise(base_graph(state), state.estimate, iterations=100, relative_tolerance=1e-8)
+    estimate, _, error = optimize(base_graph(state), state.estimate, iterations=100, relative_tolerance=1e-8)
     return replace(state, estimate=estimate, graph_error=error)

@@ -20,7 +20,7 @@ from nolbo_ppl.inference.slam.graph import SlamEstimate, linearise
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
 from nolbo_ppl.inference.slam.map_refinement import finish
-from nolbo_ppl.inference.slam.noise.odometry_noise import stated_scales
+from nolbo_ppl.inference.slam.noise.odometry_noise import stated_sigmas
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 DRIFT_FACTORS = (1.0, 3.0, 0.5, 6.0)
@@ -37,7 +37,7 @@ AMBIGUOUS = 0.05
 """A rival with more weight than this makes the answer ambiguous."""
 RAISED = 3.0
 """Stated scales of the odometry raised by more than this at the end of a run: it is repeated from its start."""
-LEAST_WEIGHT = 1e-4
+MIN_WEIGHT = 1e-4
 """Hypotheses of less weight are not kept."""
 
 
@@ -81,7 +81,7 @@ def start_of_run(state: SlamState, k: int) -> SlamState:
     if k == 0:
         return state
     factor = DRIFT_FACTORS[k % len(DRIFT_FACTORS)]
-    rotation, translation = stated_scales(state.problem, state.config)
+    rotation, translation = stated_sigmas(state.problem, state.config)
     noise = replace(
         state.noise,
         rotation_step=state.noise.rotation_step * (1.0 if rotation else factor),
@@ -96,7 +96,7 @@ def start_of_run(state: SlamState, k: int) -> SlamState:
 
 def raised_odometry(start: SlamState, end: SlamState) -> SlamState | None:
     """The start with the odometry's scales of the end, where stated ones were raised by more than `RAISED`; else None."""
-    if not any(stated_scales(start.problem, start.config)) or not len(start.noise.rotation_step):
+    if not any(stated_sigmas(start.problem, start.config)) or not len(start.noise.rotation_step):
         return None
     ratios = (
         float(np.median(end.noise.rotation_step / start.noise.rotation_step)),
@@ -177,7 +177,7 @@ def explore(
     kept = [
         MapHypothesis(float(w), run.log_evidence, replace(run.state, config=config), run.associations)
         for w, run in zip(weight, distinct)
-        if w > LEAST_WEIGHT
+        if w > MIN_WEIGHT
     ]
     best = replace(distinct[0], state=replace(distinct[0].state, config=config))
     return best, tuple(kept)

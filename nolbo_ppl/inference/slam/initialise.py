@@ -18,18 +18,18 @@ from nolbo_ppl.inference.slam.detection_features import (
 )
 from nolbo_ppl.inference.slam.gaussian import log_normal
 from nolbo_ppl.inference.slam.graph import (
+    LandmarkEqualities,
     Linearisation,
-    Links,
     SlamEstimate,
-    add_links,
+    add_landmark_equalities,
     linearise,
-    optimise,
+    optimize,
 )
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.absurd_values import without_absurd_values
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
-from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, stated_scales
+from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, stated_sigmas
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
 from nolbo_ppl.inference.slam.orientation import OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
@@ -125,7 +125,7 @@ def linearise_state(state: SlamState) -> Linearisation:
     """Linearise the graph with its links at the estimate, each link by its robust weight there."""
 
     graph = base_graph(state)
-    add_links(graph, state.links, state.config.robust_width)
+    add_landmark_equalities(graph, state.links, state.config.robust_width)
     return linearise(graph, state.estimate)
 
 
@@ -142,7 +142,7 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
     prior = fit_prior(problem.observations, config, noise)
     tracklets = build_tracklets(problem, noise, config, prior)
     state = init_from_tracklets(problem, config, noise, prior, tracklets)
-    if all(stated_scales(problem, config)) or not len(tracklets):
+    if all(stated_sigmas(problem, config)) or not len(tracklets):
         return state
     # Tracks were broken where the default scales were much too small: track once more with the better ones.
     growth = (
@@ -179,11 +179,11 @@ def init_from_tracklets(
         weight=weight,
         features=tracklet_features(measurements, config, prior, rows, landmark, weight, len(static)),
         estimate=first_estimate(measurements, problem.odometry, config, rows, landmark, len(static)),
-        links=Links.none(),
+        links=LandmarkEqualities.none(),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
     )
     for repeat in range(3):
-        estimate, _, error = optimise(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
+        estimate, _, error = optimize(base_graph(state), state.estimate, iterations=10 if repeat == 0 else 4)
         state = replace(state, estimate=estimate, graph_error=error)
         state = calibrate(state) if repeat < 2 else state
         state = replace(state, weight=inlier_weights(state))

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, Links, SlamEstimate
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.orientation import orientation_log_density
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
@@ -115,7 +115,7 @@ def gap_covariance(samples: PosteriorSamples, a: Int[np.ndarray, " p"], b: Int[n
     return out
 
 
-def without_own_links(
+def without_own_landmark_equalities(
     gap: Float[np.ndarray, "p 3"],
     covariance: Float[np.ndarray, "p 3 3"],
     information: Float[np.ndarray, " p"],
@@ -145,7 +145,7 @@ def without_own_links(
 
 
 def link_information(
-    links: Links, estimate: SlamEstimate, width: float | None, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
+    links: LandmarkEqualities, estimate: SlamEstimate, width: float | None, a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"]
 ) -> Float[np.ndarray, " p"]:
     """Information that the link of each pair holds on its gap in the graph, m^-2; 0 where it has none."""
     if not len(links) or not len(a):
@@ -171,7 +171,7 @@ def candidate_pairs(
     *,
     inflation: float,
     floor: float,
-    links: Links | None = None,
+    links: LandmarkEqualities | None = None,
 ) -> Pairs:
     """All pairs (newer, older) that are never seen together and whose gap is inside the gate, with their evidence.
 
@@ -204,7 +204,7 @@ def candidate_pairs(
     gap, covariance = position[a] - position[b], gap_covariance(samples, a, b)
     if links is not None:
         own = link_information(links, estimate, config.robust_width, a, b)
-        gap, covariance = without_own_links(gap, covariance, own)
+        gap, covariance = without_own_landmark_equalities(gap, covariance, own)
     covariance = inflation * covariance + floor**2 * np.eye(3)
     square, log_det = squared_distance(gap, covariance)
     inside = square < POSITION_GATE

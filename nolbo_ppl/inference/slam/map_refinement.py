@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections, rates_report
-from nolbo_ppl.inference.slam.em import make_links
+from nolbo_ppl.inference.slam.em import make_landmark_equalities
 from nolbo_ppl.inference.slam.frame_model import exposures_of, initial_frame_model
-from nolbo_ppl.inference.slam.graph import Links, SlamEstimate, linearise, optimise
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate, linearise, optimize
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
     base_graph,
@@ -37,13 +37,13 @@ SMALLEST_MARGINAL = 0.01
 """Associations of lower probability are left out of the map's M-step."""
 
 
-def surviving_links(state: SlamState) -> Links:
-    """Links that the robust solution keeps: those it stretches far are contradicted by the rest."""
+def surviving_landmark_equalities(state: SlamState) -> LandmarkEqualities:
+    """LandmarkEqualities that the robust solution keeps: those it stretches far are contradicted by the rest."""
     links = state.links
     position = state.estimate.T_world_landmark[:, :3, 3]
     stretch = np.linalg.norm(position[links.a] - position[links.b], axis=1) / np.maximum(links.scale[:, 1], 1e-12)
     keep = stretch < BROKEN_LINK
-    return Links(links.a[keep], links.b[keep], links.weight[keep], links.T_a_b[keep], links.scale[keep])
+    return LandmarkEqualities(links.a[keep], links.b[keep], links.weight[keep], links.T_a_b[keep], links.scale[keep])
 
 
 def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
@@ -58,7 +58,7 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
         landmark=landmark,
         static=np.arange(count),
         features=features,
-        links=Links.none(),
+        links=LandmarkEqualities.none(),
         closed={},
         estimate=estimate,
     )
@@ -67,7 +67,7 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
 def solve_clean(state: SlamState, repeats: int = 3, tolerance: float = 1e-8) -> SlamState:
     """Solve without kernels; between solves only the frozen weights of detections change."""
     for _ in range(repeats):
-        estimate, _, error = optimise(base_graph(state), state.estimate, iterations=30, relative_tolerance=tolerance)
+        estimate, _, error = optimize(base_graph(state), state.estimate, iterations=30, relative_tolerance=tolerance)
         state = replace(state, estimate=estimate, graph_error=error)
         weight = inlier_weights(state)
         settled = np.abs(weight - state.weight).max(initial=0.0) < 0.02
@@ -108,7 +108,7 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
     if not len(good):
         return state
     weight = 1.0 / (1.0 + np.exp(-np.minimum(value[good], 30.0)))
-    links = make_links(state, pairs.a[good], pairs.b[good], weight)
+    links = make_landmark_equalities(state, pairs.a[good], pairs.b[good], weight)
     return relabel(state, join(links, frames, 0.5))
 
 
@@ -128,7 +128,7 @@ def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, 
 
 def solve_soft(state: SlamState, tolerance: float = 1e-8) -> SlamState:
     """The M-step of the map: solve with the marginals as frozen weights."""
-    estimate, _, error = optimise(base_graph(state), state.estimate, iterations=30, relative_tolerance=tolerance)
+    estimate, _, error = optimize(base_graph(state), state.estimate, iterations=30, relative_tolerance=tolerance)
     return replace(state, estimate=estimate, graph_error=error)
 
 
@@ -176,7 +176,7 @@ def fit_odometry(state: SlamState, rounds: int = 4, tolerance: float = 0.05) -> 
 def finish(state: SlamState) -> tuple[SlamState, Associations]:
     """Merge, solve clean, associate every detection with the map, solve again: the final state and its associations."""
     rng = np.random.default_rng([state.config.seed, 104729])
-    links = surviving_links(state)
+    links = surviving_landmark_equalities(state)
     cluster = join(links, frames_of_landmarks(state), state.config.merge_weight)
     state = solve_clean(relabel(state, cluster), repeats=2, tolerance=1e-5)
     # Several passes of one object show what one track cannot: how far the detector errs from view to view.

@@ -11,11 +11,13 @@ raise the posterior. It closes no loop after drift, since its covariances hold t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.pose import inverse, make_pose, relative, skew, so3_log, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, fit_prior, latent_log_density
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
@@ -27,7 +29,7 @@ from nolbo_ppl.inference.slam.graph import (
     add_observation_factors,
     landmark_key,
     odometry_factors,
-    optimise,
+    optimize,
     pose_key,
     to_values,
 )
@@ -63,7 +65,7 @@ class Modes:
 
 
 @dataclass(frozen=True)
-class PlainState:
+class ReferenceEmState:
     """State of the plain EM."""
 
     problem: SlamProblem
@@ -91,7 +93,7 @@ class PlainState:
 
 
 @dataclass(frozen=True)
-class PlainInfo:
+class ReferenceEmInfo:
     """What one iteration of the plain EM saw."""
 
     iteration: int
@@ -141,13 +143,13 @@ def split_modes(problem: SlamProblem, measurements: Measurements, config: SlamCo
     return Modes(index, np.concatenate(log_weight), R, angles)
 
 
-def plain_init(
+def em_init(
     problem: SlamProblem,
     config: SlamConfig,
     T_world_landmark: Float[np.ndarray, "m 4 4"],
     latent: Float[np.ndarray, "m d"] | None = None,
     noise: NoiseModel | None = None,
-) -> PlainState:
+) -> ReferenceEmState:
     """Start from odometry and a given set of landmarks.
 
     Raises:
@@ -159,7 +161,7 @@ def plain_init(
     prior = fit_prior(table, config, noise)
     measurements = resolve(table, noise, config, prior)
     distance = np.linalg.norm(table.position, axis=1)
-    return PlainState(
+    return ReferenceEmState(
         problem=problem,
         config=config,
         noise=noise,
@@ -173,7 +175,7 @@ def plain_init(
     )
 
 
-def position_log_density(state: PlainState) -> Float[np.ndarray, "k m"]:
+def position_log_density(state: ReferenceEmState) -> Float[np.ndarray, "k m"]:
     """Log density of every observed position under every landmark, m^-3."""
     seen = state.measurements
     landmarks = state.estimate.T_world_landmark[:, :3, 3]
@@ -181,7 +183,7 @@ def position_log_density(state: PlainState) -> Float[np.ndarray, "k m"]:
     return log_normal(local - seen.position[:, None], seen.covariance[:, None])
 
 
-def mode_log_density(state: PlainState) -> Float[np.ndarray, "g m"]:
+def mode_log_density(state: ReferenceEmState) -> Float[np.ndarray, "g m"]:
     """Log density of every mode of every orientation under every landmark over the uniform density, weight included."""
     modes, estimate = state.modes, state.estimate
     frame = state.measurements.frame[modes.row]
@@ -201,7 +203,7 @@ def mode_log_density(state: PlainState) -> Float[np.ndarray, "g m"]:
     return out
 
 
-def e_step(state: PlainState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarray, "k m"], float]:
+def e_step(state: ReferenceEmState) -> tuple[Float[np.ndarray, "g m"], Float[np.ndarray, "k m"], float]:
     """Weights of every mode and of every detection for every landmark, and the log evidence of all frames.
 
     Orientation and latent enter as ratios to the uniform density on SO(3) and to the population, so that every hypothesis is
@@ -247,7 +249,7 @@ def position_factor(
 
 
 def frozen_graph(
-    state: PlainState, weights: Float[np.ndarray, "k m"] | None, mode_weights: Float[np.ndarray, "g m"] | None
+    state: ReferenceEmState, weights: Float[np.ndarray, "k m"] | None, mode_weights: Float[np.ndarray, "g m"] | None
 ) -> gtsam.NonlinearFactorGraph:
     """Odometry and priors, and observations at frozen weights when given: a position a pair, a rotation a mode."""
     graph = odometry_factors(state.problem, state.noise)
@@ -272,12 +274,12 @@ def frozen_graph(
     return graph
 
 
-def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
+def em_step(state: ReferenceEmState) -> tuple[ReferenceEmState, ReferenceEmInfo]:
     """One E-step and one M-step; the bound is that of the state it was given."""
     mode_weights, weights, evidence = e_step(state)
     prior_error = frozen_graph(state, None, None).error(to_values(state.estimate))
-    info = PlainInfo(state.iteration + 1, evidence - prior_error, evidence, weights.sum(axis=0))
-    estimate, _, _ = optimise(frozen_graph(state, weights, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10)
+    info = ReferenceEmInfo(state.iteration + 1, evidence - prior_error, evidence, weights.sum(axis=0))
+    estimate, _, _ = optimize(frozen_graph(state, weights, mode_weights), state.estimate, iterations=30, relative_tolerance=1e-10)
     latent = state.latent
     value, variance = state.measurements.latent, state.measurements.latent_variance
     if value.shape[1]:
@@ -288,12 +290,18 @@ def plain_step(state: PlainState) -> tuple[PlainState, PlainInfo]:
     return replace(state, estimate=estimate, latent=latent, iteration=state.iteration + 1), info
 
 
-def plain_solve(state: PlainState, iterations: int = 20, tolerance: float = 1e-4) -> tuple[PlainState, tuple[PlainInfo, ...]]:
+def em_solve(
+    state: ReferenceEmState, iterations: int = 20, tolerance: float = 1e-4
+) -> tuple[ReferenceEmState, tuple[ReferenceEmInfo, ...]]:
     """Iterate until the bound rises by less than `tolerance` nats."""
-    infos: list[PlainInfo] = []
+    infos: list[ReferenceEmInfo] = []
     for _ in range(iterations):
-        state, info = plain_step(state)
+        state, info = em_step(state)
         infos.append(info)
         if len(infos) > 1 and infos[-1].bound - infos[-2].bound < tolerance:
             break
     return state, tuple(infos)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

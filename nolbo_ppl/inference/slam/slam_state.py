@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
 from nolbo_ppl.inference.slam.frame_model import FrameModel
 from nolbo_ppl.inference.slam.graph import (
-    Links,
+    LandmarkEqualities,
     ObservationFactors,
     SlamEstimate,
     add_landmark_priors,
@@ -52,7 +52,7 @@ class SlamState:
     """Features of the landmarks."""
     estimate: SlamEstimate
     """Poses and landmarks."""
-    links: Links
+    links: LandmarkEqualities
     """Weighted links in use."""
     typical_range: float
     """Median range of detections, m."""

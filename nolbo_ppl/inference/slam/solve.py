@@ -50,9 +50,9 @@ def solve(
 
     Example:
         >>> import nolbo_ppl
-        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
         >>> rng = np.random.default_rng(0)
-        >>> drive = simulate_drive(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
+        >>> drive = simulate_sequence(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
 
         >>> result = nolbo_ppl.solve(nolbo_ppl.SlamProblem(drive.odometry, drive.observations))
         >>> result.T_world_camera.shape, len(result.landmarks) > 5

@@ -22,7 +22,7 @@ from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamPr
 
 GATE = 30.0
 """Squared Mahalanobis distance beyond which a detection cannot belong to a track (3 degrees of freedom: p = 1e-6)."""
-LEAST_NEW = -5.0
+MIN_NEW = -5.0
 """Log odds of a new object against clutter below which a detection founds no track."""
 
 
@@ -99,7 +99,7 @@ class Tracker:
                 self._orient(track, modes.select(np.array([i])), seen.symmetry[[i]])
             assigned[i], weight[i] = self.index[track], found_pairs.weight[p]
         # Hopeless ones found no track: the more there are, the more chance pairs.
-        rows = np.flatnonzero((assigned < 0) & (found_pairs.null > 0.5) & (log_new - log_clutter > LEAST_NEW))
+        rows = np.flatnonzero((assigned < 0) & (found_pairs.null > 0.5) & (log_new - log_clutter > MIN_NEW))
         if len(rows):
             assigned[rows] = self._found(seen, modes, rows, frame)
         return assigned, weight
@@ -116,7 +116,7 @@ class Tracker:
         both = np.flatnonzero(seen.oriented[k] & self.oriented[j])
         if len(both):
             value[both] += self._orientation(j[both], modes.select(k[both]), seen.symmetry[k[both]])
-        value += self.prior.pair_log_ratio(
+        value += self.prior.log_likelihood_ratio(
             seen.latent[k],
             seen.latent_variance[k],
             seen.category[k],

@@ -6,10 +6,12 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.synthetic.renderer.camera_view import Mesh
@@ -19,7 +21,7 @@ INSTANCES = 2000
 """Default number of parametric instances a category has."""
 SEED_STRIDE = 100_000
 """Instance k of the scenes with seed s is `shape_from_seed(category, s * SEED_STRIDE + k)`: no two seeds share one."""
-KEPT = 1024
+CACHE_SIZE = 1024
 """Shapes with their ray-casting structures held in memory: more than one block of scenes draws from."""
 BLOCK = 1024
 """Scenes that share a window of instances, so that a shape made once is used about five times."""
@@ -44,7 +46,7 @@ class ShapeAsset:
         return packed_voxels(self.shape)
 
 
-class ShapePool:
+class ShapeLibrary:
     """A fixed, ordered set of instances, made or prepared when first drawn.
 
     Two pools of different seeds share no parametric instance, so that scenes of another seed show unseen shapes.
@@ -94,7 +96,7 @@ class ShapePool:
                 shape = self.cad[category][number]
             mesh = Mesh(shape.vertices, shape.faces, shape.part)
             self._kept[key] = ShapeAsset(shape, mesh, self._first[category] + number)
-            if len(self._kept) > KEPT:
+            if len(self._kept) > CACHE_SIZE:
                 self._kept.popitem(last=False)
         else:
             self._kept.move_to_end(key)
@@ -107,7 +109,7 @@ class ShapePool:
         within = int(rng.integers(min(WINDOW, count)))
         return self.item(category, (block * WINDOW + within) % count)
 
-    def item_of(self, number: int) -> ShapeAsset:
+    def asset_of(self, number: int) -> ShapeAsset:
         """The instance of that number over all categories."""
         category = next(name for name in reversed(self.categories) if self._first[name] <= number)
         return self.item(category, number - self._first[category])
@@ -123,3 +125,7 @@ class ShapePool:
 def packed_voxels(shape: Shape, n: int = VOXELS) -> UInt8[np.ndarray, " bytes"]:
     """The occupancy of a shape at n^3, packed to bits in C order."""
     return np.packbits(np.ascontiguousarray(shape.voxels(n)).reshape(-1))
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

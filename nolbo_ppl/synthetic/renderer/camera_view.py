@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -11,6 +12,7 @@ from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.synthetic.renderer.materials import Material
 from nolbo_ppl.synthetic.renderer.textures import PLANE_PATTERNS
 
@@ -54,7 +56,7 @@ class MeshInstance:
     offset: Float[np.ndarray, " 3"]
     materials: tuple[Material, ...]
     """Material of each part number of the mesh."""
-    owner: int
+    instance_id: int
     """Number of the labelled object it belongs to, or -1 for clutter."""
     texture_seed: int = 0
     """Which random texture its materials show."""
@@ -110,7 +112,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Backdrop:
+class Environment:
     """What is seen where no mesh is."""
 
     zenith: Float[np.ndarray, " 3"]
@@ -156,4 +158,8 @@ class View:
     """Light from above where no lamp shines."""
     ambient_ground: Float[np.ndarray, " 3"]
     """Light from below."""
-    backdrop: Backdrop
+    backdrop: Environment
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

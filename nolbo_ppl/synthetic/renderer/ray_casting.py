@@ -34,9 +34,9 @@ class Hits:
     """Face of that mesh."""
     silhouette: Float[np.ndarray, " placed"]
     """Pixels each mesh covers when it is alone, those beyond the border of the image included."""
-    owner_visible: dict[int, float]
+    instance_visible: dict[int, float]
     """Pixels in which each labelled object is in front."""
-    owner_silhouette: dict[int, float]
+    instance_silhouette: dict[int, float]
     """Pixels each labelled object covers when it is alone, beyond the border included."""
     windows: tuple[Float[np.ndarray, " 4"] | None, ...]
     """Box px of all that each mesh may cover, None when it is out of sight."""
@@ -115,21 +115,21 @@ def trace(view: View) -> Hits:
             primitive, t = primitive.reshape(b1 - b0, a1 - a0), t.reshape(b1 - b0, a1 - a0)
             nearer = t < depth[box]
             depth[box][nearer], index[box][nearer], face[box][nearer] = t[nearer], k, primitive[nearer]
-        if placed.owner >= 0 and (x0, y0, x1, y1) != (a0, b0, a1, b1) and x1 > x0 and y1 > y0:
+        if placed.instance_id >= 0 and (x0, y0, x1, y1) != (a0, b0, a1, b1) and x1 > x0 and y1 > y0:
             step = int(np.ceil(np.sqrt((x1 - x0) * (y1 - y0) / 16384)))
             rays = pixel_directions(x0, y0, x1, y1, view.intrinsics, step)
             pixels = rays[:, :2] * view.intrinsics[:2] + view.intrinsics[2:]
             beyond = ((pixels < 0) | (pixels > [width, height])).any(axis=1)
             silhouette[k] += np.count_nonzero(_first_hits(placed, rays[beyond])[0] >= 0) * step**2
-    owners = np.array([placed.owner for placed in view.placed] + [-1])
-    visible = np.bincount(owners[index[index >= 0]] + 1, minlength=owners.max() + 2)
+    instance_ids = np.array([placed.instance_id for placed in view.placed] + [-1])
+    visible = np.bincount(instance_ids[index[index >= 0]] + 1, minlength=instance_ids.max() + 2)
     return Hits(
         depth,
         index,
         face,
         silhouette,
-        owner_visible={p.owner: float(visible[p.owner + 1]) for p in view.placed if p.owner >= 0},
-        owner_silhouette={p.owner: float(silhouette[k]) for k, p in enumerate(view.placed) if p.owner >= 0},
+        instance_visible={p.instance_id: float(visible[p.instance_id + 1]) for p in view.placed if p.instance_id >= 0},
+        instance_silhouette={p.instance_id: float(silhouette[k]) for k, p in enumerate(view.placed) if p.instance_id >= 0},
         windows=windows,
     )
 

@@ -16,11 +16,11 @@ from nolbo_ppl.synthetic.renderer.materials import hsv
 
 LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)
 """Linear light of eight-bit display values (gamma 2.2)."""
-KEPT = 512
+CACHE_SIZE = 512
 """Decoded photographs held in memory."""
 
 
-def list_pictures(folder: str | PathLike[str]) -> list[Path]:
+def list_background_images(folder: str | PathLike[str]) -> list[Path]:
     """Pictures of a folder and its sub-folders, sorted by path. Raises `InputError` when there is none."""
     return sorted(images_of(folder, recursive=True))
 
@@ -29,7 +29,7 @@ class Photographs:
     """Crops of the photographs of a folder; decoded ones are kept, at most twice as large as the scenes."""
 
     def __init__(self, folder: str | PathLike[str], size: int) -> None:
-        self.paths = list_pictures(folder)
+        self.paths = list_background_images(folder)
         self.size = size
         self._kept: OrderedDict[int, UInt8[np.ndarray, "h w 3"]] = OrderedDict()
 
@@ -44,7 +44,7 @@ class Photographs:
                 shape = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
                 picture = picture.resize(shape, Image.Resampling.BILINEAR, reducing_gap=2.0)
             self._kept[number] = np.asarray(picture)
-            if len(self._kept) > KEPT:
+            if len(self._kept) > CACHE_SIZE:
                 self._kept.popitem(last=False)
         return self._kept[number]
 
@@ -61,7 +61,7 @@ class Photographs:
         return LINEAR[crop]
 
 
-def drawn_picture(rng: np.random.Generator, height: int, width: int) -> Float[np.ndarray, "{height} {width} 3"]:
+def drawn_background(rng: np.random.Generator, height: int, width: int) -> Float[np.ndarray, "{height} {width} 3"]:
     """A picture of nothing: coloured noise with rectangles and ellipses of other noise, in linear light."""
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
     u, v = columns / width, rows / height

@@ -64,7 +64,7 @@ def _primitive(kind: str, size: np.ndarray, rotation: np.ndarray, offset: np.nda
     return Primitive(kind, rotation * size[None, :], offset)
 
 
-def sample_clutter(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "2 3"]]:
+def sample_distractors(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "2 3"]]:
     """Draw one piece of clutter and its box (least and greatest corner), scaled to a box diagonal of 1 and centred.
 
     A third are single solids, some are posts and slabs, the rest are heaps of two to five solids.

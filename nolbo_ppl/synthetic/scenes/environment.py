@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.synthetic.renderer.camera_view import Backdrop, Light, Surface
+from nolbo_ppl._moved import renamed
+from nolbo_ppl.synthetic.renderer.camera_view import Environment, Light, Surface
 from nolbo_ppl.synthetic.renderer.materials import hsv
-from nolbo_ppl.synthetic.scenes.background_images import Photographs, drawn_picture
+from nolbo_ppl.synthetic.scenes.background_images import Photographs, drawn_background
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
 
 
@@ -55,12 +58,12 @@ def _surface(config: SceneConfig, rng: np.random.Generator, textured: bool) -> S
     return Surface(colours, pattern, frequency, int(rng.integers(2**31)))
 
 
-def sample_backdrop(
+def sample_environment(
     config: SceneConfig,
     rng: np.random.Generator,
     R_camera_world: Float[np.ndarray, "3 3"],
     photographs: Photographs | None,
-) -> Backdrop:
+) -> Environment:
     """Sky, ground, perhaps a wall; or a photograph or drawn picture in their place."""
     weights = np.array(config.backgrounds, dtype=np.float64)
     kind = int(rng.choice(4, p=weights / weights.sum()))
@@ -82,8 +85,8 @@ def sample_backdrop(
     if photograph and photographs is not None:
         picture = photographs.crop(rng, config.size, config.size)
     elif kind == 3:
-        picture = drawn_picture(rng, config.size, config.size)
-    return Backdrop(
+        picture = drawn_background(rng, config.size, config.size)
+    return Environment(
         zenith,
         horizon,
         ground,
@@ -94,3 +97,7 @@ def sample_backdrop(
         clouds=rng.uniform(0, 0.8) if rng.random() < 0.6 else 0.0,
         seed=int(rng.integers(2**31)),
     )
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -77,7 +77,7 @@ class Rendered:
     image: UInt8[np.ndarray, "h w 3"]
     intrinsics: Float[np.ndarray, " 4"]
     labels: tuple[ObjectLabel, ...]
-    owner: Int[np.ndarray, "h w"]
+    instance_id: Int[np.ndarray, "h w"]
     """Number of the label each pixel shows, or -1 (at the first ray of the pixel)."""
 
 
@@ -112,17 +112,17 @@ def _seen_objects(scene: Scene, view: View) -> tuple[View, Hits, dict[int, float
         hits = trace(view)
         visibility, gone = {}, set()
         for placed in view.placed:
-            if placed.owner < 0:
+            if placed.instance_id < 0:
                 continue
-            covered = hits.owner_silhouette[placed.owner]
-            visibility[placed.owner] = hits.owner_visible[placed.owner] / covered if covered else 0.0
+            covered = hits.instance_silhouette[placed.instance_id]
+            visibility[placed.instance_id] = hits.instance_visible[placed.instance_id] / covered if covered else 0.0
             box = amodal_box(placed, scene.view)
             side = min(box[2] - box[0], box[3] - box[1])
-            if visibility[placed.owner] < scene.least_visibility or side < scene.least_box:
-                gone.add(placed.owner)
+            if visibility[placed.instance_id] < scene.least_visibility or side < scene.least_box:
+                gone.add(placed.instance_id)
         if not gone:
             return view, hits, visibility
-        view = replace(view, placed=tuple(p for p in view.placed if p.owner < 0 or p.owner not in gone))
+        view = replace(view, placed=tuple(p for p in view.placed if p.instance_id < 0 or p.instance_id not in gone))
 
 
 def _blurred(colour: np.ndarray, scale: float) -> np.ndarray:
@@ -151,12 +151,12 @@ def render_scene(scene: Scene) -> Rendered:
     labels: list[ObjectLabel] = []
     number = np.full(len(view.placed) + 1, -1)
     for k, placed in enumerate(view.placed):
-        if placed.owner < 0:
+        if placed.instance_id < 0:
             continue
         number[k] = len(labels)
-        labels.append(_label(scene.objects[placed.owner], amodal_box(placed, scene.view), visibility[placed.owner]))
-    owner = number[hits.index[::factor, ::factor]]
-    return Rendered(image, scene.view.intrinsics, tuple(labels), owner)
+        labels.append(_label(scene.objects[placed.instance_id], amodal_box(placed, scene.view), visibility[placed.instance_id]))
+    instance_id = number[hits.index[::factor, ::factor]]
+    return Rendered(image, scene.view.intrinsics, tuple(labels), instance_id)
 
 
 def _label(thing: SceneObject, box: np.ndarray, visibility: float) -> ObjectLabel:

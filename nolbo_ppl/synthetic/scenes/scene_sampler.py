@@ -9,21 +9,21 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.synthetic.assets.shape_library import BLOCK, ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import BLOCK, ShapeLibrary
 from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance, View
 from nolbo_ppl.synthetic.renderer.materials import sample_material, sample_materials
 from nolbo_ppl.synthetic.scenes import distractors as clutter
 from nolbo_ppl.synthetic.scenes.background_images import Photographs
-from nolbo_ppl.synthetic.scenes.environment import sample_backdrop, sample_light
+from nolbo_ppl.synthetic.scenes.environment import sample_environment, sample_light
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
 from nolbo_ppl.synthetic.scenes.render_scene import Scene, SceneObject
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
 
 CAMERA_HEIGHT = 1.0
 """The scene's unit of length."""
-FARTHEST = 80.0
+MAX_DISTANCE = 80.0
 """Greatest distance of a thing, in camera heights."""
-TRIES = 12
+MAX_ATTEMPTS = 12
 """Places tried for one thing before it is given up."""
 R_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """R_camera_world of a level camera that looks along +y of a world with z up."""
@@ -80,7 +80,7 @@ class _Composer:
         diagonal spans the wished pixels: `distance = height / (sin e + half_height * pixels / focal)`.
         """
         half_world = 0.5 * np.abs(R_world_local) @ extents
-        for _ in range(TRIES):
+        for _ in range(MAX_ATTEMPTS):
             pixels = _log_uniform(self.rng, pixel_range[0], pixel_range[1] * self.size)
             pixel = self._pixel(pixels)
             ray = np.array([*((pixel - self.intrinsics[2:]) / self.intrinsics[:2]), 1.0])
@@ -91,7 +91,7 @@ class _Composer:
                 distance = float(_log_uniform(self.rng, 1.0, 20.0))
             else:
                 reach = sine + half_world[2] * ratio
-                if reach <= CAMERA_HEIGHT / FARTHEST or sine < np.sin(np.radians(self.config.least_elevation)):
+                if reach <= CAMERA_HEIGHT / MAX_DISTANCE or sine < np.sin(np.radians(self.config.least_elevation)):
                     continue
                 distance = CAMERA_HEIGHT / reach
             diagonal, centre = ratio * distance, ray * distance
@@ -113,7 +113,7 @@ class _Composer:
 
 
 def _object(
-    composer: _Composer, pool: ShapePool, block: int, owner: int, config: SceneConfig, rng: np.random.Generator
+    composer: _Composer, pool: ShapeLibrary, block: int, instance_id: int, config: SceneConfig, rng: np.random.Generator
 ) -> tuple[SceneObject, MeshInstance] | None:
     """Draw one labelled object and its place."""
     item = pool.draw(rng, block)
@@ -137,7 +137,7 @@ def _object(
         return None
     centre, diagonal = place
     R_camera_object = composer.R_camera_world @ R_world_object
-    placed = MeshInstance(item.mesh, R_camera_object * diagonal, centre, materials, owner, texture_seed)
+    placed = MeshInstance(item.mesh, R_camera_object * diagonal, centre, materials, instance_id, texture_seed)
     return SceneObject(R_camera_object, centre, diagonal, item), placed
 
 
@@ -156,9 +156,9 @@ def _unit_mesh(kind: str) -> Mesh:
     return _UNIT_MESHES[kind]
 
 
-def _clutter(composer: _Composer, config: SceneConfig, rng: np.random.Generator) -> list[MeshInstance]:
+def _distractors(composer: _Composer, config: SceneConfig, rng: np.random.Generator) -> list[MeshInstance]:
     """Draw one piece of clutter and its place."""
-    parts, box = clutter.sample_clutter(rng)
+    parts, box = clutter.sample_distractors(rng)
     roles = rng.choice(["body", "wood", "metal", "fabric", "trim"], size=len(parts), p=[0.4, 0.2, 0.1, 0.2, 0.1])
     materials = [sample_material(str(role), rng) for role in roles]
     R_world_local = _vertical(rng.uniform(-np.pi, np.pi))
@@ -179,7 +179,7 @@ def _clutter(composer: _Composer, config: SceneConfig, rng: np.random.Generator)
 def sample_scene(
     config: SceneConfig,
     rng: np.random.Generator,
-    pool: ShapePool,
+    pool: ShapeLibrary,
     photographs: Photographs | None = None,
     block: int = 0,
 ) -> Scene:
@@ -203,9 +203,9 @@ def sample_scene(
             objects.append(found[0])
             placed.append(found[1])
     for _ in range(int(rng.integers(config.clutter[0], config.clutter[1] + 1))):
-        placed.extend(_clutter(composer, config, rng))
+        placed.extend(_distractors(composer, config, rng))
     lights, ambient_sky, ambient_ground = sample_light(config, rng, composer.R_camera_world)
-    backdrop = sample_backdrop(config, rng, composer.R_camera_world, photographs)
+    backdrop = sample_environment(config, rng, composer.R_camera_world, photographs)
     angle = rng.uniform(-np.pi, np.pi)
     view = View(
         height=config.size,
@@ -233,6 +233,6 @@ def sample_scene(
     )
 
 
-def scene_at(config: SceneConfig, seed: int, index: int, pool: ShapePool, photographs: Photographs | None = None) -> Scene:
+def scene_at(config: SceneConfig, seed: int, index: int, pool: ShapeLibrary, photographs: Photographs | None = None) -> Scene:
     """Scene `index` of seed `seed`: depends on nothing else, however many processes share the work."""
     return sample_scene(config, np.random.default_rng([seed, index]), pool, photographs, index // BLOCK)

@@ -46,7 +46,7 @@ MATERIAL_ROLES: tuple[str, ...] = (
 )
 """Every role a face may have; a renderer chooses its materials by these names."""
 
-LEAST_HALF_VOXELS = 0.6
+MIN_HALF_VOXELS = 0.6
 """Parts thinner than this to each side, in voxels, are filled as if they were this thick."""
 
 
@@ -78,11 +78,11 @@ class AnalyticSolid:
     def fill(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
         """Fill every primitive in its own part of the grid (see `Solid.fill`).
 
-        Walls and panels thinner than 0.6 voxel to each side (`LEAST_HALF_VOXELS`) are thickened to that, round rods to
+        Walls and panels thinner than 0.6 voxel to each side (`MIN_HALF_VOXELS`) are thickened to that, round rods to
         0.75.
         """
         step = self.diagonal / n
-        thin = LEAST_HALF_VOXELS * step
+        thin = MIN_HALF_VOXELS * step
         pad = ROUND * thin
         ticks = (np.arange(n) + 0.5) * step - 0.5 * self.diagonal
         axes = [ticks + c for c in self.centre]

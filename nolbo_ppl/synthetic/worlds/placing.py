@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import make_pose
-from nolbo_ppl.synthetic.assets.shape_library import ShapeAsset, ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import ShapeAsset, ShapeLibrary
 from nolbo_ppl.synthetic.renderer.materials import Material, sample_materials
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
 from nolbo_ppl.synthetic.worlds.camera_path import Track
 from nolbo_ppl.synthetic.worlds.world_mesh import turned
 
-TRIES = 12
+MAX_ATTEMPTS = 12
 """Shapes looked at to find one small enough."""
 GAP = 0.04
 """Room left around every object, m."""
@@ -57,7 +57,7 @@ class WorldObject:
 class Catalogue:
     """Draws looks: new ones, or copies of those that were drawn before."""
 
-    def __init__(self, pool: ShapePool, copies: float, seed: int, rng: np.random.Generator) -> None:
+    def __init__(self, pool: ShapeLibrary, copies: float, seed: int, rng: np.random.Generator) -> None:
         self.pool, self.copies, self.seed, self.rng = pool, copies, seed, rng
         self.looks: dict[str, list[Look]] = {}
         self.count = 0
@@ -68,7 +68,7 @@ class Catalogue:
         if known and self.rng.random() < self.copies:
             return known[int(self.rng.integers(len(known)))]
         drawn = []
-        for _ in range(TRIES):
+        for _ in range(MAX_ATTEMPTS):
             drawn.append(self.pool.item(category, int(self.rng.integers(self.pool.count(category)))))
             if drawn[-1].shape.diagonal <= longest:
                 break

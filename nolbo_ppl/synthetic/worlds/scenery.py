@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from nolbo_ppl.synthetic.renderer.materials import Material, hsv, sample_material
-from nolbo_ppl.synthetic.scenes.distractors import sample_clutter, unit_mesh
+from nolbo_ppl.synthetic.scenes.distractors import sample_distractors, unit_mesh
 from nolbo_ppl.synthetic.worlds.world_mesh import Frame, StaticBuilder
 
 GLASS = (
@@ -236,7 +236,7 @@ def sign_post(builder: StaticBuilder, place: np.ndarray, heading: float, rng: np
 
 def litter(builder: StaticBuilder, place: np.ndarray, size: float, rng: np.random.Generator, z: float = 0.0) -> None:
     """A random piece of clutter of a given box diagonal standing on the ground."""
-    parts, box = sample_clutter(rng)
+    parts, box = sample_distractors(rng)
     frame = Frame(place, rng.uniform(-np.pi, np.pi))
     roles = rng.choice(["body", "wood", "metal", "fabric", "trim"], size=len(parts), p=[0.45, 0.2, 0.1, 0.2, 0.05])
     for part, role in zip(parts, roles):

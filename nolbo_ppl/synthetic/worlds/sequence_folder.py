@@ -28,7 +28,7 @@ from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.worlds.world import World, make_world
-from nolbo_ppl.synthetic.worlds.world_config import DriveConfig
+from nolbo_ppl.synthetic.worlds.world_config import SequenceConfig
 from nolbo_ppl.synthetic.worlds.world_frame import render_frame
 
 CHUNK = 8
@@ -40,7 +40,7 @@ LAYOUT = 1
 
 
 @dataclass(frozen=True)
-class DriveSummary:
+class SequenceSummary:
     """What was written."""
 
     out: Path
@@ -58,12 +58,12 @@ class DriveSummary:
 
 
 @lru_cache(maxsize=1)
-def _world(config: DriveConfig) -> World:
+def _world(config: SequenceConfig) -> World:
     """The world, made once in each process."""
     return make_world(config)
 
 
-def _write_chunk(config: DriveConfig, out: Path, first: int, last: int) -> int:
+def _write_chunk(config: SequenceConfig, out: Path, first: int, last: int) -> int:
     """Images of frames `first` to `last`, then their lines, which mark the chunk as done."""
     world, rows = _world(config), []
     for frame in range(first, last):
@@ -93,11 +93,11 @@ def describe_object(world: World, number: int) -> dict[str, Any]:
     }
 
 
-def _plain(config: DriveConfig) -> dict[str, Any]:
+def _plain(config: SequenceConfig) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(config).items()}
 
 
-def write_drive(config: DriveConfig, out: str | os.PathLike[str], workers: int = 1) -> DriveSummary:
+def write_sequence_folder(config: SequenceConfig, out: str | os.PathLike[str], workers: int = 1) -> SequenceSummary:
     """Render a drive into a folder; a run that was killed goes on where it stopped when called again.
 
     Args:
@@ -114,7 +114,7 @@ def write_drive(config: DriveConfig, out: str | os.PathLike[str], workers: int =
         return _write(config, out, workers)
 
 
-def _write(config: DriveConfig, out: Path, workers: int) -> DriveSummary:
+def _write(config: SequenceConfig, out: Path, workers: int) -> SequenceSummary:
     made = {"layout": LAYOUT, "config": _plain(config)}
     known = out / DRIVE
     if known.is_file():
@@ -132,7 +132,7 @@ def _write(config: DriveConfig, out: Path, workers: int) -> DriveSummary:
         world = _world(config)
         (out / "images").mkdir(parents=True, exist_ok=True)
         write_json(known, {**made, "version": __version__, **_facts(world)})
-        _write_truth(world, out)
+        _write_ground_truth(world, out)
         _render_missing(config, out, workers)
         rows = [row for first in range(0, config.frames, CHUNK) for _, row in read_jsonl(out / ".parts" / f"{first:06d}.jsonl")]
         write_jsonl(out / SCENES, rows)
@@ -150,7 +150,7 @@ def _facts(world: World) -> dict[str, Any]:
     }
 
 
-def _write_truth(world: World, out: Path) -> None:
+def _write_ground_truth(world: World, out: Path) -> None:
     width, height = world.config.size
     values = dict(zip(("fx", "fy", "cx", "cy"), (float(v) for v in world.intrinsics)))
     write_json(out / INTRINSICS, {**values, "width": width, "height": height})
@@ -162,7 +162,7 @@ def _write_truth(world: World, out: Path) -> None:
     save_npz(out / VOXELS, {name: item.voxels for name, item in sorted(items.items())})
 
 
-def _render_missing(config: DriveConfig, out: Path, workers: int) -> None:
+def _render_missing(config: SequenceConfig, out: Path, workers: int) -> None:
     chunks = [(first, min(first + CHUNK, config.frames)) for first in range(0, config.frames, CHUNK)]
     missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]
     jobs = [(_write_chunk, (config, out, first, last)) for first, last in missing]
@@ -172,10 +172,10 @@ def _render_missing(config: DriveConfig, out: Path, workers: int) -> None:
             bar.update(number)
 
 
-def _summary(out: Path) -> DriveSummary:
+def _summary(out: Path) -> SequenceSummary:
     facts, objects = read_json(out / DRIVE), read_json(out / OBJECTS)
     rows = [row for _, row in read_jsonl(out / SCENES)]
-    return DriveSummary(
+    return SequenceSummary(
         out=out,
         frames=len(rows),
         objects=len(objects),

@@ -25,7 +25,7 @@ from nolbo_ppl.synthetic.worlds.sequence_folder import DRIVE, INTRINSICS, OBJECT
 
 
 @dataclass(frozen=True)
-class DriveObject:
+class SequenceObject:
     """One true object of a drive."""
 
     id: str
@@ -51,7 +51,7 @@ class SequenceFolder:
     """Width and height of the images, px."""
     T_world_camera: Float[np.ndarray, "n 4 4"]
     times: Float[np.ndarray, " n"]
-    objects: tuple[DriveObject, ...]
+    objects: tuple[SequenceObject, ...]
     frames: tuple[Annotations, ...]
     """What each frame shows; every object has the `id` of `objects`."""
     facts: dict[str, Any]
@@ -71,7 +71,7 @@ class SequenceFolder:
         return read_voxels(self.path / VOXELS)
 
 
-def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
+def read_objects(path: str | os.PathLike[str]) -> tuple[SequenceObject, ...]:
     """Read `objects.json`.
 
     Raises:
@@ -80,7 +80,7 @@ def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
     rows = read_json(path)
     if not isinstance(rows, list):
         raise input_error("true objects", got=type(rows).__name__, expected="a list of objects", file=path)
-    found: list[DriveObject] = []
+    found: list[SequenceObject] = []
     for number, row in enumerate(rows):
         where = f"entry {number}: "
         if not isinstance(row, dict) or not isinstance(row.get("id"), str):
@@ -98,7 +98,7 @@ def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
         if not is_whole(symmetry):
             raise input_error(where + "symmetry", got=symmetry, expected="1 none, n n-fold, 0 free", file=path)
         found.append(
-            DriveObject(
+            SequenceObject(
                 row["id"],
                 row["category"],
                 str(row.get("instance", "")),
@@ -114,7 +114,7 @@ def read_objects(path: str | os.PathLike[str]) -> tuple[DriveObject, ...]:
     return tuple(found)
 
 
-def read_drive(path: str | os.PathLike[str]) -> SequenceFolder:
+def read_sequence_folder(path: str | os.PathLike[str]) -> SequenceFolder:
     """Read a drive folder; images are read when asked for.
 
     Raises:

@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.geometry.pose import inverse, make_pose
-from nolbo_ppl.synthetic.assets.shape_library import ShapePool
-from nolbo_ppl.synthetic.renderer.camera_view import Backdrop, Light, Mesh, Surface
+from nolbo_ppl.synthetic.assets.shape_library import ShapeLibrary
+from nolbo_ppl.synthetic.renderer.camera_view import Environment, Light, Mesh, Surface
 from nolbo_ppl.synthetic.renderer.materials import Material, hsv
 from nolbo_ppl.synthetic.scenes.environment import sample_light
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
@@ -20,7 +20,7 @@ from nolbo_ppl.synthetic.worlds.indoor import build_indoor
 from nolbo_ppl.synthetic.worlds.placing import Catalogue, Look, Placer, WorldObject
 from nolbo_ppl.synthetic.worlds.street import build_street
 from nolbo_ppl.synthetic.worlds.street_ground import LANE
-from nolbo_ppl.synthetic.worlds.world_config import DriveConfig
+from nolbo_ppl.synthetic.worlds.world_config import SequenceConfig
 from nolbo_ppl.synthetic.worlds.world_mesh import turned
 
 POOL_SEED = 50_000
@@ -33,7 +33,7 @@ RATE = 10.0
 class World:
     """Everything a frame depends on. The ground frame has z up; the world frame is that of the first camera."""
 
-    config: DriveConfig
+    config: SequenceConfig
     loop: Loop
     T_ground_camera: Float[np.ndarray, "frames 4 4"]
     objects: tuple[WorldObject, ...]
@@ -44,7 +44,7 @@ class World:
     """Directions in the ground frame."""
     ambient_sky: Float[np.ndarray, " 3"]
     ambient_ground: Float[np.ndarray, " 3"]
-    backdrop: Backdrop
+    backdrop: Environment
     exposure: float
 
     @property
@@ -86,7 +86,7 @@ def _riding(loop: Loop, s: float, lateral: float, look: Look) -> Float[np.ndarra
     return make_pose(turned(float(heading) + np.pi + np.pi / 2), np.array([*point, z]))
 
 
-def make_world(config: DriveConfig) -> World:
+def make_world(config: SequenceConfig) -> World:
     """Build a world: the same configuration gives the same world on every machine.
 
     Raises:
@@ -100,7 +100,7 @@ def make_world(config: DriveConfig) -> World:
     track = drive_track(loop, config.laps, config.opposite, LANE if street else 0.0)
     wobble = Wobble(0.18, 0.012, 0.7, 0.3, 0.3, 37.0) if street else Wobble(0.06, 0.008, 1.2, 0.4, 0.4, 9.7)
     poses = camera_poses(track, config.frames, config.step, config.camera_height, config.tilt, wobble, path_rng)
-    pool = ShapePool(CATEGORIES, seed=POOL_SEED + config.seed)
+    pool = ShapeLibrary(CATEGORIES, seed=POOL_SEED + config.seed)
     catalogue = Catalogue(pool, config.look_alikes, config.seed, look_rng)
     placer = Placer(catalogue, track, 1.8 if street else 0.75, max(0, config.objects - config.moving))
     build = build_street if street else build_indoor
@@ -117,7 +117,7 @@ def make_world(config: DriveConfig) -> World:
     )
 
 
-def _moving(config: DriveConfig, loop: Loop, catalogue: Catalogue, first: int, rng: np.random.Generator) -> list[WorldObject]:
+def _moving(config: SequenceConfig, loop: Loop, catalogue: Catalogue, first: int, rng: np.random.Generator) -> list[WorldObject]:
     """Vehicles in the opposite lane, spread over the loop, all at one speed so that they never meet."""
     made = []
     lateral, speed = LANE, -config.step * rng.uniform(0.5, 0.9)
@@ -131,7 +131,9 @@ def _moving(config: DriveConfig, loop: Loop, catalogue: Catalogue, first: int, r
     return made
 
 
-def _light(config: DriveConfig, rng: np.random.Generator) -> tuple[tuple[Light, ...], np.ndarray, np.ndarray, Backdrop, float]:
+def _light(
+    config: SequenceConfig, rng: np.random.Generator
+) -> tuple[tuple[Light, ...], np.ndarray, np.ndarray, Environment, float]:
     """Sun and sky, or the lamps of a room: fixed in the ground frame."""
     street = config.world == "street"
     ranges = SceneConfig(sun_elevation=(42.0, 62.0) if street else (68.0, 82.0), tint=0.05, second_light_probability=0.0)
@@ -143,7 +145,7 @@ def _light(config: DriveConfig, rng: np.random.Generator) -> tuple[tuple[Light, 
     horizon = np.clip(0.35 * zenith + 0.6 * zenith.max(), 0, 1)
     if not street:
         zenith = horizon = np.array(hsv(0.1, 0.03, 0.85))
-    backdrop = Backdrop(
+    backdrop = Environment(
         zenith,
         horizon,
         Surface(np.full((2, 3), 0.2)),

@@ -10,14 +10,14 @@ from nolbo_ppl.errors import input_error
 WorldName = Literal["street", "indoor"]
 WORLDS: tuple[str, ...] = ("street", "indoor")
 PRESETS: tuple[str, ...] = ("default", "demo")
-LEAST_LOOP = {"street": 70.0, "indoor": 22.0}
+MIN_LOOP = {"street": 70.0, "indoor": 22.0}
 """Shortest loop that leaves room for anything beside it, m."""
 MOST_FRAMES = 20_000
 """Frames a drive may have: the length of the loop grows with them."""
 
 
 @dataclass(frozen=True)
-class DriveConfig:
+class SequenceConfig:
     """A drive depends on these fields alone."""
 
     world: WorldName = "street"
@@ -84,11 +84,11 @@ class DriveConfig:
                 got=f"height {self.camera_height} m, tilt {self.tilt} degrees",
                 expected="height of 0.3 to 2.5 m, tilt of -20 to 45 degrees",
             )
-        if self.perimeter < LEAST_LOOP[self.world]:
+        if self.perimeter < MIN_LOOP[self.world]:
             raise input_error(
                 "loop of the drive",
                 got=f"{self.perimeter:.1f} m (step x frames / laps)",
-                expected=f"at least {LEAST_LOOP[self.world]:g} m",
+                expected=f"at least {MIN_LOOP[self.world]:g} m",
                 do="use more frames, a longer step or fewer laps",
             )
         if self.moving and (self.world != "street" or self.opposite > 0):
@@ -105,7 +105,7 @@ class DriveConfig:
         return self.step * (self.frames - 1) / (self.laps + self.opposite)
 
 
-def drive_preset(preset: str, world: WorldName, seed: int = 0) -> DriveConfig:
+def sequence_preset(preset: str, world: WorldName, seed: int = 0) -> SequenceConfig:
     """The usual drive of a world; `demo` is a short one whose loop closes just so.
 
     Raises:
@@ -113,7 +113,7 @@ def drive_preset(preset: str, world: WorldName, seed: int = 0) -> DriveConfig:
     """
     if preset not in PRESETS:
         raise input_error("unknown preset of a drive", got=repr(preset), expected=", ".join(PRESETS))
-    config = DriveConfig(world=world, seed=seed)  # raises for an unknown world
+    config = SequenceConfig(world=world, seed=seed)  # raises for an unknown world
     if world == "indoor":
         config = replace(config, step=0.25, objects=160, clutter=60, camera_height=1.5, tilt=10.0)
     if preset == "demo":

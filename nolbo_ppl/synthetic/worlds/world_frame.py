@@ -17,7 +17,7 @@ from nolbo_ppl.synthetic.scenes.scene_records import record_of
 from nolbo_ppl.synthetic.worlds.placing import WorldObject
 from nolbo_ppl.synthetic.worlds.world import World
 
-LEAST_PIXELS = 3.0
+MIN_PIXELS = 3.0
 """Objects whose box diagonal projects to fewer px are not drawn."""
 SHADOW_REACH = 2.0
 """Objects out of sight whose ball, grown by this many of its radii, meets the view still throw their shadows."""
@@ -51,7 +51,7 @@ def _reach(point: np.ndarray, radius: float, intrinsics: np.ndarray, size: tuple
 
 
 def frame_view(world: World, frame: int) -> tuple[View, tuple[WorldObject, ...]]:
-    """What a camera frame shows, and the object of each owner number."""
+    """What a camera frame shows, and the object of each instance id."""
     config, T_ground_camera = world.config, world.T_ground_camera[frame]
     T_camera_ground = inverse(T_ground_camera)
     R, t = T_camera_ground[:3, :3], T_camera_ground[:3, 3]
@@ -61,7 +61,7 @@ def frame_view(world: World, frame: int) -> tuple[View, tuple[WorldObject, ...]]
         diagonal = thing.look.item.shape.diagonal
         pose = world.T_ground_object(thing, frame) if thing.moving else thing.T_ground_object
         centre = R @ pose[:3, 3] + t
-        if diagonal * world.intrinsics[0] < LEAST_PIXELS * max(float(np.linalg.norm(centre)), 0.1):
+        if diagonal * world.intrinsics[0] < MIN_PIXELS * max(float(np.linalg.norm(centre)), 0.1):
             continue
         if not _reach(centre, 0.5 * SHADOW_REACH * diagonal, world.intrinsics, config.size):
             continue
@@ -89,7 +89,7 @@ def frame_view(world: World, frame: int) -> tuple[View, tuple[WorldObject, ...]]
 def render_frame(world: World, frame: int) -> RenderedFrame:
     """Render one frame and label the objects that are seen in it; depends on the world and the number alone.
 
-    Objects are labelled when their visibility and box reach `DriveConfig.least_visibility` and `least_box`, and they lie
+    Objects are labelled when their visibility and box reach `SequenceConfig.least_visibility` and `least_box`, and they lie
     wholly before the camera; all others stay in the picture without a label.
     """
     config = world.config
@@ -102,18 +102,18 @@ def render_frame(world: World, frame: int) -> RenderedFrame:
     ids: list[str] = []
     number = np.full(len(view.placed) + 1, -1)
     for k, placed in enumerate(view.placed):
-        if placed.owner < 0 or placed.vertices[:, 2].min() < 0.05:
+        if placed.instance_id < 0 or placed.vertices[:, 2].min() < 0.05:
             continue
-        visible, covered = hits.owner_visible[placed.owner], hits.owner_silhouette[placed.owner]
+        visible, covered = hits.instance_visible[placed.instance_id], hits.instance_silhouette[placed.instance_id]
         visibility = visible / covered if covered else 0.0
         box = amodal_box(placed, view)
         if visibility < config.least_visibility or min(box[2] - box[0], box[3] - box[1]) < config.least_box:
             continue
         number[k] = len(labels)
-        labels.append(_label(shown[placed.owner], placed, box, visibility))
-        ids.append(shown[placed.owner].id)
-    owner = number[hits.index]
-    return RenderedFrame(Rendered(image, world.intrinsics, tuple(labels), owner), tuple(ids))
+        labels.append(_label(shown[placed.instance_id], placed, box, visibility))
+        ids.append(shown[placed.instance_id].id)
+    instance_id = number[hits.index]
+    return RenderedFrame(Rendered(image, world.intrinsics, tuple(labels), instance_id), tuple(ids))
 
 
 def _label(thing: WorldObject, placed: MeshInstance, box: Float[np.ndarray, " 4"], visibility: float) -> ObjectLabel:

@@ -1,7 +1,7 @@
 """Single images from generated worlds: scenes to learn from that look like drives do.
 
 Each block of scenes shows a world of its own, street and floor by turns, from random places beside the camera's track,
-looking anywhere. It has the interface of `nolbo_ppl.synthetic.scenes.scene_source.SceneSource`.
+looking anywhere. It has the interface of `nolbo_ppl.synthetic.scenes.scene_generator.SceneGenerator`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nolbo_ppl.synthetic.scenes.render_scene import ObjectLabel, Rendered
 from nolbo_ppl.synthetic.worlds.camera_path import camera_pose
 from nolbo_ppl.synthetic.worlds.sequence_folder import LAYOUT
 from nolbo_ppl.synthetic.worlds.world import World, make_world
-from nolbo_ppl.synthetic.worlds.world_config import DriveConfig
+from nolbo_ppl.synthetic.worlds.world_config import SequenceConfig
 from nolbo_ppl.synthetic.worlds.world_frame import render_frame
 
 FIRST_WORLD = 1_000_000
@@ -29,7 +29,7 @@ NUMBERS = 1_000_000
 """Instances of a world are numbered from this times its number, plus one, apart from those of scenes and of each other."""
 VERSION = 2
 """Raised when the same seed gives other views than before."""
-TRIES = 6
+MAX_ATTEMPTS = 6
 """Places tried for an image that holds no object, or more than there are slots."""
 
 
@@ -69,7 +69,7 @@ class ViewConfig:
 def _world(kind: str, seed: int, objects: int) -> World:
     indoor = kind == "indoor"
     step, height = (0.25, 1.5) if indoor else (0.9, 1.65)
-    config = DriveConfig(
+    config = SequenceConfig(
         world="indoor" if indoor else "street",
         seed=seed,
         frames=120,
@@ -101,7 +101,7 @@ class ViewSource:
         world, number = self.world(index), index // self.config.scenes
         rng = np.random.default_rng([self.seed, 7300, index])
         rendered = self._look(world, rng)
-        for _ in range(TRIES):
+        for _ in range(MAX_ATTEMPTS):
             if 1 <= len(rendered.labels) <= SLOTS:
                 break
             rendered = self._look(world, rng)

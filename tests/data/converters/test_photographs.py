@@ -14,7 +14,7 @@ from PIL import Image
 from nolbo_ppl.data.converters.photographs import convert_photographs, read_photographs
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.training.scene_supply import SceneSupply, ShapeTable, enlarged, join_batches, to_batch
+from nolbo_ppl.training.scene_loader import SceneLoader, ShapeTable, enlarged, join_batches, to_batch
 from nolbo_ppl.training.stage_data import shares
 
 
@@ -59,7 +59,7 @@ def test_labels_arrive_in_batches(tmp_path: Path) -> None:
 def test_augmented_images_keep_what_is_not_labelled(tmp_path: Path) -> None:
     convert_photographs(read_photographs(write(tmp_path / "data")), tmp_path / "out")
     folder = SceneFolder(tmp_path / "out", size=96)
-    supply = SceneSupply(folder, ShapeTable(*folder.shapes()), 2, 0, 4, size=192)
+    supply = SceneLoader(folder, ShapeTable(*folder.shapes()), 2, 0, 4, size=192)
     small, large = to_batch(folder.batch([0])), supply.prepared(np.array([0]))
     assert small.ignore is not None and large.ignore is not None
     torch.testing.assert_close(large.ignore, 2 * small.ignore)

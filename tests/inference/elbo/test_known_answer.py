@@ -14,7 +14,7 @@ from nolbo_ppl.inference.elbo import (
     ElboResult,
     SceneELBO,
 )
-from nolbo_ppl.models.generative import conjugate_truth, expected_normal_log_prob
+from nolbo_ppl.models.generative import conjugate_target, expected_normal_log_prob
 from tests.factories import (
     assert_within,
 )
@@ -72,7 +72,7 @@ def test_svi_reaches_the_exact_posterior(closed_form: bool, steps: int, toleranc
     def loss() -> ElboResult:
         return elbo.evaluate(story, guide, y, scenes=len(y))
 
-    config = optimisation.OptimisationConfig(
+    config = optimisation.OptimizerConfig(
         steps=steps, learning_rate=0.05, start_rate=0.05, warmup=1, decay=0.9, weight_decay=0.0, ema=0.0
     )
     state = optimisation.init(guide, loss, config)
@@ -109,7 +109,7 @@ def test_conjugate_truth_and_expectation() -> None:
     grid = torch.linspace(-9, 9, 20001)
     log_joint = dist.Normal(0.0, 1.0).log_prob(grid) + dist.Normal(grid, scale).log_prob(y)
     density = torch.exp(log_joint - torch.logsumexp(log_joint, 0)) / (grid[1] - grid[0])
-    truth = conjugate_truth(y, scale)
+    truth = conjugate_target(y, scale)
     torch.testing.assert_close(truth.log_prob(grid[:, None]).exp(), density, atol=1e-9, rtol=0)
     q = dist.Normal(torch.tensor(0.3), 0.4)
     by_grid = torch.trapezoid(q.log_prob(grid).exp() * dist.Normal(grid, scale).log_prob(y), grid)

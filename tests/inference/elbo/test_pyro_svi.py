@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SHAPE_STAGE, SceneELBO, SceneLoss
-from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.training.stages import StageRun, TrainingStage
@@ -123,7 +123,7 @@ def test_gradients_of_all_doors_are_one() -> None:
 def test_the_trainer_minimises_the_same_object() -> None:
     model = tiny_model()
     for name, weights in (("scenes", INCLUSIVE), ("shapes", SHAPE_STAGE)):
-        run = StageRun(model, TrainingStage(name, OptimisationConfig(steps=1), weights))
+        run = StageRun(model, TrainingStage(name, OptimizerConfig(steps=1), weights))
         assert isinstance(run.state.loss.elbo, SceneELBO) and isinstance(run.state.loss.elbo, ELBO)  # type: ignore[attr-defined]
 
 
@@ -132,7 +132,7 @@ def test_the_shape_autoencoder_under_svi() -> None:
     model, batch = tiny_model(config), random_batch(config, scenes=1, slots=4)
     shapes = ShapeBatch(batch.voxels[0], batch.category[0], batch.instance[0], torch.randn(4, config.latent_dim))
     before = torch.cat([p.detach().flatten() for p in model.shape_guide.parameters()])
-    svi = SVI(model.shape_story, model.shape_guide, Adam({"lr": 1e-2}), loss=SceneELBO(SHAPE_STAGE))
+    svi = SVI(model.shape_model, model.shape_guide, Adam({"lr": 1e-2}), loss=SceneELBO(SHAPE_STAGE))
     losses = [svi.step(shapes) for _ in range(5)]
     assert losses[-1] < losses[0]
     assert not torch.equal(torch.cat([p.detach().flatten() for p in model.shape_guide.parameters()]), before)

@@ -16,7 +16,7 @@ from nolbo_ppl.geometry.boxes import pairwise_iou
 from nolbo_ppl.geometry.rotation import quaternion_to_matrix, ray_rotation, viewpoint_to_matrix
 from nolbo_ppl.inference.posterior.decode import position_covariance
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
-from nolbo_ppl.inference.posterior.preprocess import prepare
+from nolbo_ppl.inference.posterior.preprocess import preprocess
 from nolbo_ppl.models.guide import orientation_posterior
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
@@ -178,7 +178,7 @@ def test_no_detection_is_an_empty_answer() -> None:
     for decode in (True, False):
         found = model.observe(picture(), CAMERA, threshold=0.9999, iou_threshold=1.0, decode=decode)
         assert len(found) == 0
-        assert list(found.rows(0, "a.png")) == []
+        assert list(found.to_records(0, "a.png")) == []
         assert found.category == []
         assert found.box.shape == (0, 4)
         assert found.position_covariance.shape == (0, 3, 3)
@@ -360,7 +360,7 @@ def test_given_boxes_are_answered_in_order() -> None:
     found, none = model.observe_boxes([image, image], camera, [boxes, np.zeros((0, 4))], decode=False)
     assert len(found) == 4
     assert len(none) == 0
-    prepared = prepare(image, camera, 64, torch.float64)
+    prepared = preprocess(image, camera, 64, torch.float64)
     with torch.no_grad():
         encoding = model.model.guide.encode(prepared.image[None])
     for i, box in enumerate(boxes / 2):
@@ -372,7 +372,7 @@ def test_given_boxes_are_answered_in_order() -> None:
         look = model.model.guide.parameters_at(
             encoding, torch.tensor([0]), torch.tensor([2 * cell + best]), box=torch.from_numpy(box)[None]
         )
-        mode = look.at_mode(model.model.story.prior.label_mean())
+        mode = look.at_map_category(model.model.story.prior.label_mean())
         np.testing.assert_allclose(found.latent[i], mode.shape_loc[0].detach().numpy())
 
 
@@ -397,7 +397,7 @@ def test_calibration_reaches_every_answer() -> None:
 
 def test_rows_survive_json() -> None:
     found = observer().observe(picture(), CAMERA, threshold=0.5)
-    rows = list(found.rows(7, "000007.png"))
+    rows = list(found.to_records(7, "000007.png"))
     assert len(rows) == len(found)
     for i, row in enumerate(json.loads(json.dumps(rows, allow_nan=False))):
         assert row["frame"] == 7

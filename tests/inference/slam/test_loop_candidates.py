@@ -11,9 +11,9 @@ from scipy.stats import multivariate_normal, norm
 
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.inference.slam.clusters import join
-from nolbo_ppl.inference.slam.consistent_cliques import close_constellations, find_closing, joint_log_density, windows
+from nolbo_ppl.inference.slam.consistent_cliques import close_constellations, find_loop_closure, joint_log_density, windows
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
-from nolbo_ppl.inference.slam.graph import Links, SlamEstimate
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import (
     POSITION_GATE,
     PosteriorSamples,
@@ -117,7 +117,7 @@ def closing(position: np.ndarray, samples: PosteriorSamples) -> tuple[object, in
     config = SlamConfig()
     pairs = candidate_pairs(poses(position), samples, features(m, first=first), PRIOR, config, inflation=1.0, floor=0.05)
     fresh = pairs.select(pairs.a >= m - 6)
-    return find_closing(fresh, poses(position), samples, config, inflation=1.0, floor=0.05, log_new=float(np.log(1e-3))), m
+    return find_loop_closure(fresh, poses(position), samples, config, inflation=1.0, floor=0.05, log_new=float(np.log(1e-3))), m
 
 
 def test_constellation_is_found_and_twins_are_refused() -> None:
@@ -153,8 +153,10 @@ def test_windows_hold_every_tracklet() -> None:
         assert (np.diff(first[window]) == 1).all()  # neighbours in time
 
 
-def links(a: list[int], b: list[int], weight: list[float]) -> Links:
-    return Links(np.array(a), np.array(b), np.array(weight), np.tile(np.eye(4), (len(a), 1, 1)), np.ones((len(a), 2)))
+def links(a: list[int], b: list[int], weight: list[float]) -> LandmarkEqualities:
+    return LandmarkEqualities(
+        np.array(a), np.array(b), np.array(weight), np.tile(np.eye(4), (len(a), 1, 1)), np.ones((len(a), 2))
+    )
 
 
 def test_clusters_are_components_of_strong_links() -> None:
@@ -182,7 +184,7 @@ def test_clusters_are_components_of_strong_links() -> None:
 
 def test_a_link_does_not_speak_for_itself() -> None:
     """Two tracklets with drift between them, linked: judged without the link they are as before it."""
-    from nolbo_ppl.inference.slam.loop_candidates import link_information, without_own_links
+    from nolbo_ppl.inference.slam.loop_candidates import link_information, without_own_landmark_equalities
 
     rng = np.random.default_rng(5)
     A = rng.standard_normal((3, 3))
@@ -190,7 +192,9 @@ def test_a_link_does_not_speak_for_itself() -> None:
     information = 1.5
     after = np.linalg.inv(np.linalg.inv(before) + information * np.eye(3))
     pulled = after @ np.linalg.inv(before) @ gap
-    found_gap, found = without_own_links(np.tile(pulled, (2, 1)), np.tile(after, (2, 1, 1)), np.array([information, 0.0]))
+    found_gap, found = without_own_landmark_equalities(
+        np.tile(pulled, (2, 1)), np.tile(after, (2, 1, 1)), np.array([information, 0.0])
+    )
     share = np.max(np.linalg.eigvalsh(after)) * information
     assert share < 0.9  # nothing is cut here
     np.testing.assert_allclose(found_gap, [gap, pulled], atol=1e-10)

@@ -17,7 +17,7 @@ from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, ambiguity, mixture_covariances
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
 from nolbo_ppl.inference.slam.slam_state import SlamState
-from nolbo_ppl.structures.detections import make_table
+from nolbo_ppl.structures.detections import Detections
 
 EXACT = SlamConfig(odometry_rotation_scale=1e-7, odometry_translation_scale=1e-7, new_rate=0.01, clutter_rate=0.02)
 
@@ -25,7 +25,7 @@ EXACT = SlamConfig(odometry_rotation_scale=1e-7, odometry_translation_scale=1e-7
 def standing(points: np.ndarray, owner: np.ndarray, scale: float = 0.3) -> SlamState:
     """One detection a frame of a camera that does not move."""
     n = len(points)
-    table = make_table(np.arange(n), points, position_scale=scale, objectness=np.full(n, 0.7))
+    table = Detections.from_arrays(np.arange(n), points, position_scale=scale, objectness=np.full(n, 0.7))
     return solve_with_associations(SlamProblem(np.tile(np.eye(4), (n, 1, 1)), table), owner, EXACT)
 
 
@@ -101,7 +101,7 @@ def test_true_associations_are_least_squares() -> None:
     points = np.array([transform(inverse(truth[t]), objects[j]) for t, j in zip(frame, owner)])
     points += 0.05 * rng.standard_normal(points.shape)
     config = SlamConfig(odometry_rotation_scale=0.02, odometry_translation_scale=0.05)
-    problem = SlamProblem(np.array(odometry), make_table(frame, points, position_scale=0.05))
+    problem = SlamProblem(np.array(odometry), Detections.from_arrays(frame, points, position_scale=0.05))
     found = solve_with_associations(problem, owner, config).estimate
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -153,12 +153,12 @@ def test_runs_begin_differently_where_nothing_is_stated() -> None:
 @pytest.mark.slow
 def test_map_does_not_depend_on_the_seed() -> None:
     """Identical objects without orientations: two seeds end at one trajectory, or the answer says that it is ambiguous."""
-    from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+    from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
     from nolbo_ppl.inference.slam import solve
 
     rng = np.random.default_rng(123)
     truth = simulate_circuit(rng, laps=2, radius=20.0, frames_per_lap=40)
-    world = simulate_drive(
+    world = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=20, categories=1, latent_dim=0),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, transform
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve, solve_online
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve, solve_incremental
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.structures.detections import Detections
 
@@ -29,7 +29,7 @@ def circled(seed: int, frames: int = 90) -> tuple[SlamProblem, np.ndarray]:
 def test_one_object_is_one_landmark_and_corrects_the_odometry(seed: int, stated: dict[str, float]) -> None:
     problem, truth = circled(seed)
     before = absolute_trajectory_error(problem.odometry, truth).rmse
-    for result in (solve(problem, SlamConfig(**stated)), solve_online(problem, SlamConfig(**stated))):
+    for result in (solve(problem, SlamConfig(**stated)), solve_incremental(problem, SlamConfig(**stated))):
         assert len(result.landmarks) == 1
         assert result.landmarks[0].detections > 0.6 * len(problem.observations)
         assert result.landmarks[0].existence > 0.99

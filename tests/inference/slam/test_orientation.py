@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.geometry.pose import make_pose, rotation_angle, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.inference.slam.detection_features import fit_prior
@@ -24,7 +24,7 @@ from nolbo_ppl.inference.slam.orientation import (
     resolve_modes,
     vertical_turns,
 )
-from nolbo_ppl.io.observations import make_table
+from nolbo_ppl.io.observations import Detections
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
 Z = np.array([0.0, 0.0, 1.0])
@@ -127,7 +127,7 @@ def test_a_sure_mode_stands_alone_and_padding_says_nothing() -> None:
 def test_gradient_of_the_split_factor_is_that_of_the_mixture() -> None:
     """EM's identity: the M-step's quadratic, split by responsibilities, touches minus the log density of the mixture."""
     modes = np.stack([np.eye(3), so3_exp(0.5 * Z)])
-    table = make_table(
+    table = Detections.from_arrays(
         [0], [[0.0, 0.0, 5.0]], position_scale=1.0, mode_weight=[[0.6, 0.4]], mode_rotation=modes[None], mode_std=[[0.3, 0.3]]
     )
     problem = SlamProblem(np.eye(4)[None], table)
@@ -153,7 +153,7 @@ def test_gradient_of_the_split_factor_is_that_of_the_mixture() -> None:
 
 
 def test_scales_of_modes_follow_a_correction() -> None:
-    table = make_table(
+    table = Detections.from_arrays(
         [0], [[0, 0, 5.0]], mode_weight=[[0.6, 0.4]], mode_rotation=np.tile(np.eye(3), (1, 2, 1, 1)), mode_std=[[0.1, 0.2]]
     )
     np.testing.assert_allclose(observed_modes(table, np.array([0.3])).scale, [[0.3, 0.6]])
@@ -163,7 +163,7 @@ def test_stated_modes_find_orientations_the_best_mode_misses() -> None:
     """A detector whose best mode is a quarter turn off in 45 of 100 detections, and says so."""
     rng = np.random.default_rng(3)
     truth = simulate_circuit(rng, laps=1, frames_per_lap=60)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=20, categories=3, latent_dim=4),

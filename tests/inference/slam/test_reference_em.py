@@ -12,19 +12,19 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal, norm
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.geometry.pose import make_pose, relative, se3_exp, se3_log, so3_exp
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, plain_init, plain_solve
-from nolbo_ppl.inference.slam.reference_em import PlainState, e_step
-from nolbo_ppl.io.observations import make_table
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, em_init, em_solve
+from nolbo_ppl.inference.slam.reference_em import ReferenceEmState, e_step
+from nolbo_ppl.io.observations import Detections
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.004, odometry_translation_ratio=0.01)
 
 
-def small(seed: int, latent_dim: int = 4, rotation: float | None = 0.05) -> PlainState:
+def small(seed: int, latent_dim: int = 4, rotation: float | None = 0.05) -> ReferenceEmState:
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=1, frames_per_lap=40)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=10, categories=2, latent_dim=latent_dim),
@@ -33,12 +33,12 @@ def small(seed: int, latent_dim: int = 4, rotation: float | None = 0.05) -> Plai
     )
     assert drive.world is not None
     start = drive.world.position + rng.standard_normal(drive.world.position.shape)
-    return plain_init(SlamProblem(drive.odometry, drive.observations), CONFIG, make_pose(drive.world.rotation, start))
+    return em_init(SlamProblem(drive.odometry, drive.observations), CONFIG, make_pose(drive.world.rotation, start))
 
 
 @pytest.mark.parametrize(("seed", "latent_dim", "rotation"), [(0, 4, 0.05), (1, 0, 0.05), (2, 0, None), (3, 3, None)])
 def test_the_bound_never_falls(seed: int, latent_dim: int, rotation: float | None) -> None:
-    _, infos = plain_solve(small(seed, latent_dim, rotation), iterations=8, tolerance=-np.inf)
+    _, infos = em_solve(small(seed, latent_dim, rotation), iterations=8, tolerance=-np.inf)
     bounds = np.array([info.bound for info in infos])
     assert len(bounds) == 8
     assert bounds[-1] > bounds[0] + 0.5
@@ -60,8 +60,8 @@ def test_the_bound_never_falls_with_stated_modes() -> None:
         mode_std=np.full((len(table), 2), 0.05),
     )
     problem = SlamProblem(state.problem.odometry, table)
-    start = plain_init(problem, CONFIG, state.estimate.T_world_landmark, noise=state.noise)
-    _, infos = plain_solve(start, iterations=8, tolerance=-np.inf)
+    start = em_init(problem, CONFIG, state.estimate.T_world_landmark, noise=state.noise)
+    _, infos = em_solve(start, iterations=8, tolerance=-np.inf)
     bounds = np.array([info.bound for info in infos])
     assert bounds[-1] > bounds[0] + 0.5
     assert np.diff(bounds).min() > -1e-6 * np.abs(bounds).max()
@@ -103,7 +103,7 @@ def test_evidence_and_weights_equal_enumeration() -> None:
     rotation[:3] = (pose.inv() * true[[0, 1, 1]] * noise).as_matrix()
     symmetry, rotation_scale, q = [1, 0, 2, 1, 1], [0.1, 0.2, 1.5, np.nan, np.nan], [0.9, 0.6, 0.3, 0.8, 0.5]
     latent, spread = np.array([[0.3], [np.nan], [1.5], [-0.5], [np.nan]]), 0.4
-    table = make_table(
+    table = Detections.from_arrays(
         np.zeros(5, int),
         position,
         position_scale=0.5,
@@ -116,7 +116,7 @@ def test_evidence_and_weights_equal_enumeration() -> None:
     )
     config = replace(CONFIG, new_rate=0.02, clutter_rate=0.05, objectness_prior=0.7, correct_scales=False)
     mapped = np.array([[0.5], [1.0], [-1.0]])
-    state = plain_init(SlamProblem(T[None], table), config, landmarks, mapped)
+    state = em_init(SlamProblem(T[None], table), config, landmarks, mapped)
     _, weights, evidence = e_step(state)
     finite = latent[np.isfinite(latent)]
     population = norm(finite.mean(), np.sqrt(max(finite.var() - spread**2, 1e-12) + spread**2))
@@ -166,9 +166,11 @@ def test_evidence_and_weights_equal_enumeration() -> None:
 def test_an_orientation_that_says_nothing_costs_nothing(scale: float | None, weight: float) -> None:
     """One detection exactly on a landmark: the position alone gives odds of 2e3, with or without an orientation."""
     rotation = None if scale is None else np.eye(3)[None]
-    table = make_table([0], [[0.0, 0.0, 5.0]], position_scale=0.3, rotation=rotation, rotation_scale=scale, objectness=[0.9])
+    table = Detections.from_arrays(
+        [0], [[0.0, 0.0, 5.0]], position_scale=0.3, rotation=rotation, rotation_scale=scale, objectness=[0.9]
+    )
     config = replace(CONFIG, new_rate=1e-3, clutter_rate=1e-3, objectness_prior=0.5)
-    state = plain_init(SlamProblem(np.eye(4)[None], table), config, make_pose(np.eye(3), np.array([[0, 0, 5.0]])))
+    state = em_init(SlamProblem(np.eye(4)[None], table), config, make_pose(np.eye(3), np.array([[0, 0, 5.0]])))
     assert e_step(state)[1][0, 0] > 0.99 * weight
 
 
@@ -177,8 +179,8 @@ def test_the_bound_never_falls_with_symmetry(symmetry: int) -> None:
     state = small(5)
     table = replace(state.problem.observations, symmetry=np.full(len(state.measurements), symmetry))
     table.rotation[::3] = np.nan  # some without an orientation, under landmarks that have one
-    start = plain_init(SlamProblem(state.problem.odometry, table), CONFIG, state.estimate.T_world_landmark)
-    _, infos = plain_solve(start, iterations=5, tolerance=-np.inf)
+    start = em_init(SlamProblem(state.problem.odometry, table), CONFIG, state.estimate.T_world_landmark)
+    _, infos = em_solve(start, iterations=5, tolerance=-np.inf)
     bounds = np.array([info.bound for info in infos])
     assert bounds[-1] > bounds[0] + 0.5
     assert np.diff(bounds).min() > -1e-6 * np.abs(bounds).max()
@@ -187,9 +189,9 @@ def test_the_bound_never_falls_with_symmetry(symmetry: int) -> None:
 def test_latent_update_is_the_weighted_mean() -> None:
     odometry = np.tile(np.eye(4), (3, 1, 1))
     latent, scale = np.array([[1.0], [2.0], [4.0]]), np.array([[0.5], [1.0], [2.0]])
-    table = make_table([0, 1, 2], np.tile([0, 0, 5.0], (3, 1)), position_scale=0.1, latent=latent, latent_scale=scale)
-    state = plain_init(SlamProblem(odometry, table), CONFIG, make_pose(np.eye(3), np.array([[0, 0, 5.0]])))
+    table = Detections.from_arrays([0, 1, 2], np.tile([0, 0, 5.0], (3, 1)), position_scale=0.1, latent=latent, latent_scale=scale)
+    state = em_init(SlamProblem(odometry, table), CONFIG, make_pose(np.eye(3), np.array([[0, 0, 5.0]])))
     _, weights, _ = e_step(state)
-    after, _ = plain_solve(state, iterations=1)
+    after, _ = em_solve(state, iterations=1)
     w = weights[:, 0] / scale[:, 0] ** 2
     assert after.latent[0, 0] == pytest.approx((w @ latent[:, 0]) / w.sum())

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam import (
@@ -20,7 +20,7 @@ from nolbo_ppl.inference.slam import (
     solve_with_associations,
     step,
 )
-from nolbo_ppl.io.observations import Detections, concatenate, make_table
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
@@ -31,7 +31,7 @@ def drive(seed: int = 0, detector: DetectorConfig | None = None, laps: int = 2, 
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=laps, frames_per_lap=90)
     objects = WorldConfig(**{"objects": 45, "categories": 8, "latent_dim": 6, **world})  # type: ignore[arg-type]
-    return simulate_drive(truth, rng, world=objects, detector=detector, odometry_rotation_scale=0.01)
+    return simulate_sequence(truth, rng, world=objects, detector=detector, odometry_rotation_scale=0.01)
 
 
 def labels(result: SlamResult) -> np.ndarray:
@@ -175,7 +175,7 @@ def test_moving_objects_do_not_bend_the_trajectory() -> None:
     # A vehicle ahead that keeps its distance: static in the camera's frame, moving in the world.
     ahead = transform(inverse(world.truth[frames]), transform(world.truth[frames], np.array([0.5, 1.0, 12.0])))
     ahead += 0.1 * rng.standard_normal(ahead.shape)
-    mover = make_table(
+    mover = Detections.from_arrays(
         frames,
         ahead,
         position_scale=0.3,
@@ -186,14 +186,14 @@ def test_moving_objects_do_not_bend_the_trajectory() -> None:
         category=["c0"] * len(frames),
         id=[f"mover-{t}" for t in frames],
     )
-    both = concatenate([world.observations, mover])
+    both = Detections.concatenate([world.observations, mover])
     clean = solve(SlamProblem(world.odometry, world.observations), CONFIG)
     result = solve(SlamProblem(world.odometry, both), CONFIG)
     assert ate(result.T_world_camera, world.truth) < 1.2 * ate(clean.T_world_camera, world.truth) + 0.05
 
 
 def empty_table() -> Detections:
-    return make_table(np.zeros(0, int), np.zeros((0, 3)))
+    return Detections.from_arrays(np.zeros(0, int), np.zeros((0, 3)))
 
 
 @pytest.mark.parametrize("case", ["no observations", "one landmark", "one frame", "one observation", "no loop", "jump"])
@@ -228,7 +228,7 @@ def test_malformed_problems_raise() -> None:
     with pytest.raises(InputError, match="row 1"):
         SlamProblem(bad, empty_table())
     with pytest.raises(InputError, match="frame out of range"):
-        SlamProblem(np.tile(np.eye(4), (3, 1, 1)), make_table([7], np.ones((1, 3))))
+        SlamProblem(np.tile(np.eye(4), (3, 1, 1)), Detections.from_arrays([7], np.ones((1, 3))))
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import beta, multivariate_normal
 
-from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_with_associations
 from nolbo_ppl.inference.slam.class_posterior import class_posterior, fit_confusion, votes_log_likelihood
@@ -22,7 +22,7 @@ from nolbo_ppl.inference.slam.graph import linearise
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
-from nolbo_ppl.io.observations import make_table
+from nolbo_ppl.io.observations import Detections
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
 
@@ -32,7 +32,7 @@ def solved(seed: int, detector: DetectorConfig) -> tuple[SimulatedSequence, Slam
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=2, radius=22.0, frames_per_lap=45)[:60]
     world = WorldConfig(objects=25, categories=6, latent_dim=6)
-    drive = simulate_drive(truth, rng, world=world, detector=detector, odometry_rotation_scale=0.01)
+    drive = simulate_sequence(truth, rng, world=world, detector=detector, odometry_rotation_scale=0.01)
     score, real = np.clip(drive.observations.objectness, 1e-6, 1 - 1e-6), drive.object_of >= 0
     true, false = (beta(10 * mean, 10 * (1 - mean)).pdf(score) for mean in detector.objectness)
     share = real.mean()
@@ -96,7 +96,7 @@ def test_an_object_that_leaves_is_doubted() -> None:
     stated = []
     for first in (58, 30):  # in view and unseen before
         seen = np.array([[1.0, 0.5, 8.0], [1.05, 0.45, 8.02]])
-        table = make_table(
+        table = Detections.from_arrays(
             np.concatenate([frames, [first, first + 1]]),
             np.concatenate([position, seen]),
             position_scale=0.1,
@@ -142,7 +142,7 @@ def test_votes_are_a_mixture_over_rates() -> None:
 
 
 def test_patterns_of_detections_have_mass_one() -> None:
-    table = make_table([0, 1], [[0.0, 0.0, 5.0], [0.0, 0.0, 6.0]], position_scale=0.1)
+    table = Detections.from_arrays([0, 1], [[0.0, 0.0, 5.0], [0.0, 0.0, 6.0]], position_scale=0.1)
     noise = estimate_noise(SlamProblem(np.tile(np.eye(4), (2, 1, 1)), table), CONFIG)
     model = initial_frame_model(resolve(table, noise, CONFIG, fit_prior(table, CONFIG, noise)), CONFIG, 2)
     hits = np.arange(8.0)
@@ -155,7 +155,7 @@ def test_the_density_of_detections_is_a_density(flat: bool) -> None:
     """Monte Carlo over a box: the detections a frame; a flat world is as thick as its measurement, not infinitely dense."""
     rng = np.random.default_rng(0)
     position = rng.uniform([-5, -1, 4], [5, 1, 20], (400, 3)) * [1, 0 if flat else 1, 1]
-    table = make_table(np.repeat(np.arange(100), 4), position, position_scale=0.2)
+    table = Detections.from_arrays(np.repeat(np.arange(100), 4), position, position_scale=0.2)
     noise = estimate_noise(SlamProblem(np.tile(np.eye(4), (100, 1, 1)), table), replace(CONFIG, correct_scales=False))
     model = initial_frame_model(resolve(table, noise, CONFIG, fit_prior(table, CONFIG, noise)), CONFIG, 100)
     low, high = np.array([-15.0, -3.0, -6.0]), np.array([15.0, 3.0, 30.0])
@@ -165,7 +165,7 @@ def test_the_density_of_detections_is_a_density(flat: bool) -> None:
 
 
 def test_the_field_of_view_bounds_what_could_be_seen() -> None:
-    table = make_table(np.zeros(20, int), np.linspace([-8, 0, 9], [8, 0, 10], 20), position_scale=0.1)
+    table = Detections.from_arrays(np.zeros(20, int), np.linspace([-8, 0, 9], [8, 0, 10], 20), position_scale=0.1)
     noise = estimate_noise(SlamProblem(np.eye(4)[None], table), CONFIG)
     narrow = replace(CONFIG, field_of_view=(np.pi / 2, np.pi / 3))
     model = initial_frame_model(resolve(table, noise, narrow, fit_prior(table, narrow, noise)), narrow, 1)
@@ -181,12 +181,12 @@ def test_identical_objects_give_no_evidence() -> None:
     rng = np.random.default_rng(0)
     for d in (8, 128):
         latent = 0.7 * rng.standard_normal((600, d))
-        table = make_table(np.arange(600), np.tile([0, 0, 5.0], (600, 1)), latent=latent, latent_scale=0.7)
+        table = Detections.from_arrays(np.arange(600), np.tile([0, 0, 5.0], (600, 1)), latent=latent, latent_scale=0.7)
         prior = fit_prior(table, CONFIG)
         landmark = 0.7 / np.sqrt(30) * rng.standard_normal((600, d))
         one = np.full((600, d), 0.7**2)
         none = np.full(600, -1)
-        ratio = prior.pair_log_ratio(latent, one, none, landmark, one / 30, none)
+        ratio = prior.log_likelihood_ratio(latent, one, none, landmark, one / 30, none)
         exact = latent_log_density(latent, landmark, one + one / 30) - latent_log_density(latent, 0 * latent, one)
         assert abs(ratio.mean() - exact.mean()) < 0.1 * np.sqrt(d)
         assert ratio.mean() < 0.3
@@ -200,7 +200,7 @@ def test_a_detection_is_judged_without_itself() -> None:
     point = np.array([[0.4, 0.2, 6.0], [-1.0, 0.1, 7.0]])
     frame, owner = np.repeat(np.arange(3), 2), np.tile([0, 1], 3)
     position = point[owner] - odometry[frame, :3, 3] + 0.2 * rng.standard_normal((6, 3))
-    table = make_table(frame, position, position_scale=0.2)
+    table = Detections.from_arrays(frame, position, position_scale=0.2)
     config = SlamConfig(odometry_rotation_scale=0.005, odometry_translation_scale=0.1, correct_scales=False)
     problem = SlamProblem(odometry, table)
     state = solve_with_associations(problem, owner, config)

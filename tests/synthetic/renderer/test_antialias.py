@@ -9,7 +9,7 @@ import pytest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.synthetic.renderer.antialias import shade_smoothly, uneven
-from nolbo_ppl.synthetic.renderer.camera_view import Backdrop, Light, Mesh, MeshInstance, Surface, View
+from nolbo_ppl.synthetic.renderer.camera_view import Environment, Light, Mesh, MeshInstance, Surface, View
 from nolbo_ppl.synthetic.renderer.materials import PATTERNS, Material
 from nolbo_ppl.synthetic.renderer.ray_casting import average_down, shade, trace, trace_pixels
 from nolbo_ppl.synthetic.renderer.textures import SOLID, SURFACE_PATTERNS, surface_pattern
@@ -18,10 +18,10 @@ from nolbo_ppl.synthetic.scenes.distractors import unit_mesh
 LIGHT = np.array([0.3, -0.8, -0.52]) / np.linalg.norm([0.3, -0.8, -0.52])
 
 
-def thing(kind: str, size: float, offset: list[float], colour: tuple[float, float, float], owner: int = -1) -> MeshInstance:
+def thing(kind: str, size: float, offset: list[float], colour: tuple[float, float, float], instance_id: int = -1) -> MeshInstance:
     vertices, faces = unit_mesh(kind)
     mesh = Mesh(vertices, faces, np.zeros(len(faces), dtype=np.int64))
-    return MeshInstance(mesh, size * np.eye(3), np.array(offset), (Material(colour, specular=0.0),), owner)
+    return MeshInstance(mesh, size * np.eye(3), np.array(offset), (Material(colour, specular=0.0),), instance_id)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def view() -> View:
         lights=(Light(LIGHT, np.full(3, 0.6)),),
         ambient_sky=np.full(3, 0.4),
         ambient_ground=np.full(3, 0.2),
-        backdrop=Backdrop(np.array([0.2, 0.4, 0.8]), np.full(3, 0.7), Surface(np.full((2, 3), 0.4))),
+        backdrop=Environment(np.array([0.2, 0.4, 0.8]), np.full(3, 0.7), Surface(np.full((2, 3), 0.4))),
     )
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.synthetic.renderer import textures
-from nolbo_ppl.synthetic.renderer.camera_view import Backdrop, Light, Mesh, MeshInstance, Surface, View
+from nolbo_ppl.synthetic.renderer.camera_view import Environment, Light, Mesh, MeshInstance, Surface, View
 from nolbo_ppl.synthetic.renderer.materials import PATTERNS, Material, material_table, sample_material
 from nolbo_ppl.synthetic.renderer.ray_casting import average_down, pixel_directions, shade, shadowed, to_display, trace
-from nolbo_ppl.synthetic.scenes.distractors import KINDS, sample_clutter, unit_mesh
+from nolbo_ppl.synthetic.scenes.distractors import KINDS, sample_distractors, unit_mesh
 from nolbo_ppl.synthetic.shapes import MATERIAL_ROLES
 
 GREY = Material((0.4, 0.4, 0.4), specular=0.0)
@@ -25,10 +25,10 @@ def rotation(rng: np.random.Generator) -> np.ndarray:
     return q * np.sign(np.linalg.det(q))
 
 
-def placed(kind: str, linear: np.ndarray, offset: np.ndarray, owner: int = -1, material: Material = GREY) -> MeshInstance:
+def placed(kind: str, linear: np.ndarray, offset: np.ndarray, instance_id: int = -1, material: Material = GREY) -> MeshInstance:
     vertices, faces = unit_mesh(kind)
     mesh = Mesh(vertices, faces, np.zeros(len(faces), dtype=np.int64))
-    return MeshInstance(mesh, linear, np.asarray(offset), (material,), owner)
+    return MeshInstance(mesh, linear, np.asarray(offset), (material,), instance_id)
 
 
 def make_view(things: list[MeshInstance], lights: tuple[Light, ...] = (), size: int = 32, **backdrop) -> View:
@@ -46,7 +46,7 @@ def make_view(things: list[MeshInstance], lights: tuple[Light, ...] = (), size: 
         lights=lights,
         ambient_sky=np.full(3, 0.5),
         ambient_ground=np.full(3, 0.2),
-        backdrop=Backdrop(np.array([0.2, 0.4, 0.8]), np.full(3, 0.7), Surface(FLAT), **backdrop),
+        backdrop=Environment(np.array([0.2, 0.4, 0.8]), np.full(3, 0.7), Surface(FLAT), **backdrop),
     )
 
 
@@ -96,7 +96,7 @@ def test_trace_agrees_with_brute_force(crowd: list[MeshInstance]) -> None:
         alone, _ = brute_force([thing], np.zeros_like(rays), rays)
         inside = (alone >= 0).sum()
         assert hits.silhouette[k] >= inside - 3
-        assert hits.owner_visible[k] == pytest.approx((index == k).sum(), abs=3)
+        assert hits.instance_visible[k] == pytest.approx((index == k).sum(), abs=3)
 
 
 def test_shadows_agree_with_brute_force(crowd: list[MeshInstance]) -> None:
@@ -116,21 +116,21 @@ def test_nearer_thing_hides_the_farther_one() -> None:
     for order in ([near, far], [far, near]):
         hits = trace(make_view(order))
         middle = order[hits.index[16, 16]]
-        assert middle.owner == 0
+        assert middle.instance_id == 0
         assert hits.depth[16, 16] == pytest.approx(1.8, rel=1e-5)
-    assert hits.owner_visible[0] == hits.owner_silhouette[0]
-    assert hits.owner_visible[1] < hits.owner_silhouette[1]
+    assert hits.instance_visible[0] == hits.instance_silhouette[0]
+    assert hits.instance_visible[1] < hits.instance_silhouette[1]
 
 
 def test_silhouette_counts_what_the_border_cuts_off() -> None:
     thing = placed("box", 0.6 * np.eye(3), [0, 0, 3.0], 0)
     whole = trace(make_view([thing]))
-    assert whole.owner_visible[0] == whole.owner_silhouette[0]
+    assert whole.instance_visible[0] == whole.instance_silhouette[0]
     view = make_view([thing])
     cut = replace(view, intrinsics=view.intrinsics + np.array([0, 0, 14.0, 0]))  # half of it is beyond the right border
     hits = trace(cut)
-    assert hits.owner_silhouette[0] == whole.owner_silhouette[0]
-    assert 0.2 < hits.owner_visible[0] / hits.owner_silhouette[0] < 0.8
+    assert hits.instance_silhouette[0] == whole.instance_silhouette[0]
+    assert 0.2 < hits.instance_visible[0] / hits.instance_silhouette[0] < 0.8
 
 
 def test_lambert_and_shadow_on_the_ground() -> None:
@@ -233,7 +233,7 @@ def test_unit_meshes_are_closed_and_fill_the_unit_cube(kind: str) -> None:
 def test_clutter_has_a_unit_diagonal() -> None:
     rng = np.random.default_rng(3)
     for _ in range(50):
-        parts, box = sample_clutter(rng)
+        parts, box = sample_distractors(rng)
         corners = np.concatenate([unit_mesh(p.kind)[0] @ p.linear.T + p.offset for p in parts])
         np.testing.assert_allclose(np.stack((corners.min(axis=0), corners.max(axis=0))), box, atol=1e-9)
         assert np.linalg.norm(box[1] - box[0]) == pytest.approx(1.0)

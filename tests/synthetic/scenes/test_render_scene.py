@@ -12,26 +12,26 @@ from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
 from nolbo_ppl.geometry.rotation import geodesic_angle, ray_rotation, viewpoint_to_matrix
-from nolbo_ppl.synthetic.assets.shape_library import SEED_STRIDE, ShapePool
+from nolbo_ppl.synthetic.assets.shape_library import SEED_STRIDE, ShapeLibrary
 from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance
 from nolbo_ppl.synthetic.renderer.ray_casting import trace
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
 from nolbo_ppl.synthetic.scenes.label_arrays import allocentric_viewpoints, empty_labels, fill_rendered
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, Scene, amodal_box, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import DIFFICULTIES, SceneConfig, full, preset, standard
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.scenes.scene_sampler import camera_rotation
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
 
 COUNT = 24
 
 
 @pytest.fixture(scope="module")
-def source() -> SceneSource:
-    return SceneSource(replace(standard(64), objects=(1, 6)), seed=3, instances=3)
+def source() -> SceneGenerator:
+    return SceneGenerator(replace(standard(64), objects=(1, 6)), seed=3, instances=3)
 
 
 @pytest.fixture(scope="module")
-def rendered(source: SceneSource) -> list[tuple[Scene, Rendered]]:
+def rendered(source: SceneGenerator) -> list[tuple[Scene, Rendered]]:
     scenes = [source.scene(index) for index in range(COUNT)]
     return [(scene, render_scene(scene)) for scene in scenes]
 
@@ -55,7 +55,7 @@ def test_box_encloses_the_pixels_of_its_object(rendered: list[tuple[Scene, Rende
     tight = []
     for _, image in rendered:
         for number, label in enumerate(image.labels):
-            rows, columns = np.nonzero(image.owner == number)
+            rows, columns = np.nonzero(image.instance_id == number)
             assert len(rows), "an object without a pixel is labelled"
             x0, y0, x1, y1 = label.box
             assert x0 <= columns.min() + 0.5 and columns.max() + 0.5 <= x1
@@ -71,7 +71,7 @@ def test_every_pixel_lies_on_the_labelled_shape(rendered: list[tuple[Scene, Rend
         kept = _kept(scene, image)
         hits = trace(replace(scene.view, placed=kept))
         for number, label in enumerate(image.labels):
-            rows, columns = np.nonzero(image.owner == number)
+            rows, columns = np.nonzero(image.instance_id == number)
             thing = next(t for t in scene.objects if t.R_camera_object is label.R_camera_object)
             depth = hits.depth[rows, columns] * (label.size / thing.diagonal)
             fx, fy, cx, cy = image.intrinsics
@@ -92,20 +92,20 @@ def test_every_pixel_lies_on_the_labelled_shape(rendered: list[tuple[Scene, Rend
 def _kept(scene: Scene, image: Rendered) -> tuple[MeshInstance, ...]:
     """Clutter and the objects that kept their labels."""
     wanted = [id(label.R_camera_object) for label in image.labels]
-    owners = {k for k, thing in enumerate(scene.objects) if id(thing.R_camera_object) in wanted}
-    return tuple(p for p in scene.view.placed if p.owner < 0 or p.owner in owners)
+    instance_ids = {k for k, thing in enumerate(scene.objects) if id(thing.R_camera_object) in wanted}
+    return tuple(p for p in scene.view.placed if p.instance_id < 0 or p.instance_id in instance_ids)
 
 
 def test_visibility_is_the_seen_share_of_the_whole_silhouette(rendered: list[tuple[Scene, Rendered]]) -> None:
     partly = 0
     for scene, image in rendered:
-        kept = [p for p in _kept(scene, image) if p.owner >= 0]
+        kept = [p for p in _kept(scene, image) if p.instance_id >= 0]
         assert len(kept) == len(image.labels)
         for number, (thing, label) in enumerate(zip(kept, image.labels)):
             intrinsics = scene.view.intrinsics + np.array([0, 0, 64, 64])
             large = replace(scene.view, placed=(thing,), height=192, width=192, intrinsics=intrinsics)
             alone = np.count_nonzero(trace(large).index >= 0)  # one image size more on every side
-            assert label.visibility == pytest.approx((image.owner == number).sum() / alone, rel=0.06)
+            assert label.visibility == pytest.approx((image.instance_id == number).sum() / alone, rel=0.06)
             assert standard().least_visibility <= label.visibility <= 1
             partly += label.visibility < 0.9
     assert partly > 5
@@ -116,33 +116,33 @@ def test_nothing_seen_goes_unlabelled(rendered: list[tuple[Scene, Rendered]]) ->
     removed = 0
     for scene, image in rendered:
         removed += len(scene.objects) - len(image.labels)
-        assert set(np.unique(image.owner)) - {-1} == set(range(len(image.labels)))
+        assert set(np.unique(image.instance_id)) - {-1} == set(range(len(image.labels)))
         again = render_scene(replace(scene, view=replace(scene.view, placed=_kept(scene, image))))
         np.testing.assert_array_equal(again.image, image.image)
     assert removed > 0
 
 
-def test_scenes_depend_on_seed_and_index_alone(source: SceneSource, rendered: list[tuple[Scene, Rendered]]) -> None:
-    fresh = SceneSource(source.config, seed=3, instances=3)
+def test_scenes_depend_on_seed_and_index_alone(source: SceneGenerator, rendered: list[tuple[Scene, Rendered]]) -> None:
+    fresh = SceneGenerator(source.config, seed=3, instances=3)
     for index in (7, 2):
         again = fresh.render(index)
         np.testing.assert_array_equal(again.image, rendered[index][1].image)
         for a, b in zip(again.labels, rendered[index][1].labels):
             np.testing.assert_array_equal(a.box, b.box)
             assert a.instance == b.instance
-    other = SceneSource(source.config, seed=4, instances=3).render(7)
+    other = SceneGenerator(source.config, seed=4, instances=3).render(7)
     assert not np.array_equal(other.image, rendered[7][1].image)
 
 
 def test_seeds_share_no_shape() -> None:
     names = []
     for seed in (0, 1):
-        pool = ShapePool(seed=seed, instances=SEED_STRIDE)
+        pool = ShapeLibrary(seed=seed, instances=SEED_STRIDE)
         names.append({pool.item("bottle", k).shape.instance for k in (0, 1, SEED_STRIDE - 1)})
     assert not names[0] & names[1]
-    pool = ShapePool(("bottle", "car"), seed=0, instances=5)
+    pool = ShapeLibrary(("bottle", "car"), seed=0, instances=5)
     assert pool.total == 10
-    assert pool.item_of(7) is pool.item("car", 2)
+    assert pool.asset_of(7) is pool.item("car", 2)
     assert pool.item("car", 2).number == 7
     drawn = {pool.draw(np.random.default_rng(k), block=0).number for k in range(80)}
     assert drawn == set(range(10))
@@ -150,7 +150,7 @@ def test_seeds_share_no_shape() -> None:
 
 def test_object_frame_shows_its_front_at_azimuth_zero() -> None:
     """At azimuth 0 the camera sees the front lamps of a car and not its rear ones; at 180 degrees the reverse."""
-    pool = ShapePool(("car",), seed=0, instances=6)
+    pool = ShapeLibrary(("car",), seed=0, instances=6)
     for azimuth, seen, hidden in ((0.0, "light_front", "light_rear"), (np.pi, "light_rear", "light_front")):
         shares = {seen: 0, hidden: 0}
         for k in range(6):
@@ -158,7 +158,7 @@ def test_object_frame_shows_its_front_at_azimuth_zero() -> None:
             viewpoint = torch.tensor([azimuth, 0.2, 0.0], dtype=torch.float64)
             R = viewpoint_to_matrix(viewpoint).numpy()
             thing = MeshInstance(Mesh(shape.vertices, shape.faces, shape.part), R, np.array([0, 0, 1.6]), (), 0)
-            view = replace(SceneSource(standard(64), seed=0, instances=1).scene(0).view, placed=(thing,))
+            view = replace(SceneGenerator(standard(64), seed=0, instances=1).scene(0).view, placed=(thing,))
             hits = trace(replace(view, intrinsics=np.array([90.0, 90, 32, 32])))
             parts = shape.part[hits.face[hits.index >= 0]]
             for role in shares:
@@ -229,7 +229,7 @@ def test_footprints_meet_when_they_share_a_point() -> None:
 
 def test_objects_stand_on_the_ground_and_do_not_touch(rendered: list[tuple[Scene, Rendered]]) -> None:
     for scene, _ in rendered:
-        for thing, placed in zip(scene.objects, [p for p in scene.view.placed if p.owner >= 0]):
+        for thing, placed in zip(scene.objects, [p for p in scene.view.placed if p.instance_id >= 0]):
             height = placed.vertices @ scene.view.up + scene.view.camera_height
             if thing.item.shape.category != "aeroplane":
                 assert height.min() == pytest.approx(0, abs=1e-6 * thing.diagonal + 1e-9)
@@ -238,7 +238,7 @@ def test_objects_stand_on_the_ground_and_do_not_touch(rendered: list[tuple[Scene
 
 
 def test_azimuths_and_sizes_cover_their_ranges() -> None:
-    source = SceneSource(standard(64), seed=0, instances=1)
+    source = SceneGenerator(standard(64), seed=0, instances=1)
     side: list[float] = []
     labels = empty_labels(80)
     labels["intrinsics"][:] = 1
@@ -247,7 +247,7 @@ def test_azimuths_and_sizes_cover_their_ranges() -> None:
         for slot, thing in enumerate(scene.objects):
             labels["rotation"][row, slot], labels["position"][row, slot] = thing.R_camera_object, thing.centre
             labels["has_viewpoint"][row, slot] = labels["has_position"][row, slot] = True
-        boxes = [amodal_box(p, scene.view) for p in scene.view.placed if p.owner >= 0]
+        boxes = [amodal_box(p, scene.view) for p in scene.view.placed if p.instance_id >= 0]
         side += [max(box[2] - box[0], box[3] - box[1]) for box in boxes]
     azimuth, elevation, _ = allocentric_viewpoints(labels)[labels["has_viewpoint"]].T
     n = len(azimuth)
@@ -260,7 +260,7 @@ def test_azimuths_and_sizes_cover_their_ranges() -> None:
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
 def test_presets_render(difficulty: str) -> None:
     config = replace(preset(difficulty, 32), supersample=2 if difficulty == "easy" else 1)
-    source = SceneSource(config, seed=1, instances=1)
+    source = SceneGenerator(config, seed=1, instances=1)
     images = [source.render(k).image for k in range(3)]
     assert all(image.shape == (32, 32, 3) and image.dtype == np.uint8 for image in images)
     assert min(image.std() for image in images) > 1
@@ -273,28 +273,28 @@ def test_photographs_lie_behind_the_objects(tmp_path) -> None:
     for k in range(2):
         Image.fromarray(rng.integers(0, 255, (90, 120, 3), dtype=np.uint8)).save(tmp_path / f"{k}.png")
     config = replace(full(32), photographs=1.0)
-    with_picture = SceneSource(config, seed=0, instances=1, backgrounds=str(tmp_path))
+    with_picture = SceneGenerator(config, seed=0, instances=1, backgrounds=str(tmp_path))
     assert with_picture.scene(0).view.backdrop.picture is not None
-    assert not np.array_equal(with_picture.render(0).image, SceneSource(config, seed=0, instances=1).render(0).image)
+    assert not np.array_equal(with_picture.render(0).image, SceneGenerator(config, seed=0, instances=1).render(0).image)
     with pytest.raises(InputError, match="no image in the folder"):
         (tmp_path / "empty").mkdir()
-        SceneSource(config, backgrounds=str(tmp_path / "empty")).scene(0)
+        SceneGenerator(config, backgrounds=str(tmp_path / "empty")).scene(0)
     with pytest.raises(InputError, match="no such folder of images"):
-        SceneSource(config, backgrounds=str(tmp_path / "absent")).scene(0)
+        SceneGenerator(config, backgrounds=str(tmp_path / "absent")).scene(0)
     (tmp_path / "empty" / "broken.jpg").write_bytes(b"not a picture")
     with pytest.raises(InputError, match=r"broken.jpg: not a readable image"):
-        SceneSource(config, backgrounds=str(tmp_path / "empty")).scene(0)
+        SceneGenerator(config, backgrounds=str(tmp_path / "empty")).scene(0)
 
 
 def test_cad_shapes_take_the_place_of_generated_ones() -> None:
-    shapes = ShapePool(("car", "sofa"), seed=9, instances=2)
+    shapes = ShapeLibrary(("car", "sofa"), seed=9, instances=2)
     cad = tuple(shapes.item(c, k).shape for c in ("car", "sofa") for k in range(2))
-    source = SceneSource(replace(standard(32), empty_probability=0.0), seed=0, cad=cad)
+    source = SceneGenerator(replace(standard(32), empty_probability=0.0), seed=0, cad=cad)
     names = {label.instance for k in range(12) for label in source.render(k).labels}
     assert names and names <= {shape.instance for shape in cad}
     assert "cad" in source.describe()["shapes"]
     with pytest.raises(InputError, match="no CAD shape of the wanted categories"):
-        ShapePool(("bus",), cad=cad)
+        ShapeLibrary(("bus",), cad=cad)
 
 
 def test_bad_configurations() -> None:
@@ -309,9 +309,9 @@ def test_bad_configurations() -> None:
     with pytest.raises(InputError, match="unknown difficulty: got 'hard', expected easy, standard, full"):
         preset("hard")
     with pytest.raises(InputError, match="instances a category"):
-        ShapePool(CATEGORIES, instances=0)
+        ShapeLibrary(CATEGORIES, instances=0)
     with pytest.raises(InputError, match="seed of the shapes"):
-        ShapePool(CATEGORIES, seed=-1)
+        ShapeLibrary(CATEGORIES, seed=-1)
     with pytest.raises(InputError, match="more objects than slots"):
-        rendered = SceneSource(replace(standard(64), objects=(5, 6), empty_probability=0.0), seed=3, instances=1)
+        rendered = SceneGenerator(replace(standard(64), objects=(5, 6), empty_probability=0.0), seed=3, instances=1)
         fill_rendered(empty_labels(1, 1), 0, max((rendered.render(k) for k in range(4)), key=lambda r: len(r.labels)))

@@ -330,7 +330,7 @@ def test_voxels_agree_with_ray_casting_of_the_parts(category: str, monkeypatch: 
         thick = item.voxels(n).ravel()
         assert (expected & ~thick).sum() <= 0.005 * expected.sum() + 2
         with monkeypatch.context() as patch:
-            patch.setattr(shape_module, "LEAST_HALF_VOXELS", 0.0)
+            patch.setattr(shape_module, "MIN_HALF_VOXELS", 0.0)
             exact = item.voxels(n).ravel()
         # Round parts have coarse meshes inscribed in them: the difference is a thin rind.
         assert (expected & ~exact).sum() <= 0.005 * expected.sum() + 2

@@ -14,16 +14,18 @@ from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse
 from nolbo_ppl.io.files import read_json, read_jsonl, write_json, write_jsonl
-from nolbo_ppl.synthetic.worlds import DriveConfig, read_drive, write_drive
+from nolbo_ppl.synthetic.worlds import SequenceConfig, read_sequence_folder, write_sequence_folder
 from nolbo_ppl.synthetic.worlds import sequence_folder as folder
 
-CONFIG = DriveConfig(world="indoor", frames=18, step=0.4, laps=0.25, objects=24, clutter=4, size=(96, 64), supersample=1, seed=8)
+CONFIG = SequenceConfig(
+    world="indoor", frames=18, step=0.4, laps=0.25, objects=24, clutter=4, size=(96, 64), supersample=1, seed=8
+)
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("drive") / "a"
-    write_drive(CONFIG, out)
+    write_sequence_folder(CONFIG, out)
     return out
 
 
@@ -69,7 +71,7 @@ def test_files_of_the_contract(written: Path) -> None:
 
 
 def test_read_back(written: Path) -> None:
-    drive = read_drive(written)
+    drive = read_sequence_folder(written)
     assert len(drive) == 18 and drive.size == (96, 64) and drive.image(2).shape == (64, 96, 3)
     things = {thing.id: thing for thing in drive.objects}
     checked = 0
@@ -91,7 +93,7 @@ def test_read_back(written: Path) -> None:
 
 def test_a_drive_is_also_a_folder_of_scenes(written: Path) -> None:
     scenes = SceneFolder(written, size=96)
-    assert len(scenes) == 18 and len(scenes.records[0]) == len(read_drive(written).frames[0])
+    assert len(scenes) == 18 and len(scenes.records[0]) == len(read_sequence_folder(written).frames[0])
 
 
 def test_stopped_runs_go_on(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,30 +112,30 @@ def test_stopped_runs_go_on(written: Path, tmp_path: Path, monkeypatch: pytest.M
     out = tmp_path / "b"
     monkeypatch.setattr(folder, "render_frame", dying)
     with pytest.raises(KeyboardInterrupt):
-        write_drive(CONFIG, out)
+        write_sequence_folder(CONFIG, out)
     assert not (out / "scenes.jsonl").exists() and not list(out.rglob("*.tmp*"))
     with pytest.raises(InputError, match=r"not a complete drive.*nolbo drive --out, which also resumes"):
-        read_drive(out)
+        read_sequence_folder(out)
     monkeypatch.setattr(folder, "render_frame", counting)
-    summary = write_drive(CONFIG, out)
+    summary = write_sequence_folder(CONFIG, out)
     assert rendered == list(range(8, 18))
     assert content(out) == content(written)
-    assert write_drive(CONFIG, out) == summary and len(rendered) == 10  # complete: nothing is left to do
+    assert write_sequence_folder(CONFIG, out) == summary and len(rendered) == 10  # complete: nothing is left to do
     assert summary.frames == 18 and summary.objects == 24 and 0 < summary.seen <= 24 and summary.labels > 20
 
 
 @pytest.mark.slow
 def test_files_do_not_depend_on_the_number_of_processes(written: Path, tmp_path: Path) -> None:
-    write_drive(CONFIG, tmp_path / "c", workers=2)
+    write_sequence_folder(CONFIG, tmp_path / "c", workers=2)
     assert content(tmp_path / "c") == content(written)
 
 
 def test_other_drives_are_refused(written: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"the folder holds another drive.*choose another --out"):
-        write_drive(replace(CONFIG, seed=9), written)
+        write_sequence_folder(replace(CONFIG, seed=9), written)
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="the folder is not empty"):
-        write_drive(CONFIG, tmp_path)
+        write_sequence_folder(CONFIG, tmp_path)
 
 
 def test_malformed_objects(written: Path, tmp_path: Path) -> None:
@@ -143,7 +145,7 @@ def test_malformed_objects(written: Path, tmp_path: Path) -> None:
     def refused(match: str, **change: object) -> None:
         write_json(out / "objects.json", [{**good[0], **change}, *good[1:]])
         with pytest.raises(InputError, match=match):
-            read_drive(out)
+            read_sequence_folder(out)
 
     refused(r"objects\.json: entry 0: category: got spoon, expected aeroplane", category="spoon")
     refused(r"entry 0: id", id=3)
@@ -154,11 +156,11 @@ def test_malformed_objects(written: Path, tmp_path: Path) -> None:
     refused(r"got two with one id", id=good[1]["id"])
     write_json(out / "objects.json", {})
     with pytest.raises(InputError, match=r"true objects: got dict, expected a list"):
-        read_drive(out)
+        read_sequence_folder(out)
     write_json(out / "objects.json", good[1:])
-    if any(good[0]["id"] in frame.id for frame in read_drive(written).frames):
+    if any(good[0]["id"] in frame.id for frame in read_sequence_folder(written).frames):
         with pytest.raises(InputError, match=r"scenes\.jsonl:\d+: id: got O0, expected one of objects\.json"):
-            read_drive(out)
+            read_sequence_folder(out)
 
 
 def test_malformed_files(written: Path, tmp_path: Path) -> None:
@@ -166,16 +168,16 @@ def test_malformed_files(written: Path, tmp_path: Path) -> None:
     rows = [row for _, row in read_jsonl(out / "scenes.jsonl")]
     write_jsonl(out / "scenes.jsonl", rows[:-1])
     with pytest.raises(InputError, match=r"lengths differ: got 17 frames, 18 poses, 18 times"):
-        read_drive(out)
+        read_sequence_folder(out)
     write_jsonl(out / "scenes.jsonl", rows)
     (out / "times.txt").write_text("soon\n")
     with pytest.raises(InputError, match=r"times\.txt:1: not a time"):
-        read_drive(out)
+        read_sequence_folder(out)
     write_json(out / "intrinsics.json", {"fx": 1})
     with pytest.raises(InputError, match=r"intrinsics\.json: intrinsics: fy: got"):
-        read_drive(out)
+        read_sequence_folder(out)
     with pytest.raises(InputError, match="not a complete drive"):
-        read_drive(tmp_path / "absent")
+        read_sequence_folder(tmp_path / "absent")
     (written.parent / "bad.png").write_text("no picture")
     with pytest.raises(InputError, match="not a readable image"):
         folder.read_image(written.parent / "bad.png")

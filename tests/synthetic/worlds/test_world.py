@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.synthetic.assets.shape_library import SEED_STRIDE, ShapePool
-from nolbo_ppl.synthetic.worlds import DriveConfig, World, drive_preset, make_world
+from nolbo_ppl.synthetic.assets.shape_library import SEED_STRIDE, ShapeLibrary
+from nolbo_ppl.synthetic.worlds import SequenceConfig, World, make_world, sequence_preset
 from nolbo_ppl.synthetic.worlds.placing import Catalogue
 from nolbo_ppl.synthetic.worlds.world import POOL_SEED
 
@@ -97,7 +97,7 @@ def test_look_alikes_share_shape_and_colours(street: World) -> None:
 
 
 def test_no_copies_where_none_are_wanted() -> None:
-    catalogue = Catalogue(ShapePool(seed=3, instances=500), 0.0, 1, np.random.default_rng(2))
+    catalogue = Catalogue(ShapeLibrary(seed=3, instances=500), 0.0, 1, np.random.default_rng(2))
     looks = [catalogue.pick("bottle") for _ in range(12)]
     assert len({look.seed for look in looks}) == 12
     assert catalogue.pick("car", 5.0).item.shape.diagonal <= 5.0 + 0.5
@@ -137,7 +137,7 @@ def test_moving_objects_keep_to_their_lane(street: World) -> None:
 @pytest.mark.parametrize("name", ["street", "indoor"])
 @pytest.mark.parametrize("preset", ["default", "demo"])
 def test_presets(name: str, preset: str) -> None:
-    config = drive_preset(preset, name, 3)  # type: ignore[arg-type]
+    config = sequence_preset(preset, name, 3)  # type: ignore[arg-type]
     assert (config.world, config.seed) == (name, 3)
     assert config.laps > 1 and (config.frames, config.objects) == ((120, 60) if preset == "demo" else (300, config.objects))
 
@@ -164,11 +164,11 @@ def test_presets(name: str, preset: str) -> None:
 )
 def test_bad_configurations(options: dict, match: str) -> None:
     with pytest.raises(InputError, match=match):
-        DriveConfig(**options)
+        SequenceConfig(**options)
 
 
 def test_unknown_presets() -> None:
     with pytest.raises(InputError, match=r"unknown preset of a drive: got 'long', expected default, demo"):
-        drive_preset("long", "street")
+        sequence_preset("long", "street")
     with pytest.raises(InputError, match="unknown world: got 'sea'"):
-        drive_preset("demo", "sea")  # type: ignore[arg-type]
+        sequence_preset("demo", "sea")  # type: ignore[arg-type]

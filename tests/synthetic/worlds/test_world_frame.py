@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from nolbo_ppl.geometry.pose import inverse
 from nolbo_ppl.synthetic.renderer.ray_casting import trace
-from nolbo_ppl.synthetic.worlds import DriveConfig, World, make_world, render_frame
+from nolbo_ppl.synthetic.worlds import SequenceConfig, World, make_world, render_frame
 from nolbo_ppl.synthetic.worlds.world_frame import frame_view
 
 
@@ -23,7 +23,7 @@ def world(request: pytest.FixtureRequest) -> World:
 def slow_street() -> World:
     """A short piece of a street, in steps small enough to match the pictures of neighbouring frames."""
     return make_world(
-        DriveConfig(frames=10, step=0.7, laps=0.08, objects=12, clutter=4, size=(256, 128), supersample=2, seed=2, noise=0.0)
+        SequenceConfig(frames=10, step=0.7, laps=0.08, objects=12, clutter=4, size=(256, 128), supersample=2, seed=2, noise=0.0)
     )
 
 
@@ -62,7 +62,7 @@ def test_pixels_of_an_object_lie_in_its_box(world: World) -> None:
     for k in range(0, config.frames, 5):
         rendered = render_frame(world, k).rendered
         for number, label in enumerate(rendered.labels):
-            rows, columns = np.nonzero(rendered.owner == number)
+            rows, columns = np.nonzero(rendered.instance_id == number)
             assert len(rows) > 0
             assert columns.min() >= np.floor(label.box[0]) and columns.max() < np.ceil(label.box[2])
             assert rows.min() >= np.floor(label.box[1]) and rows.max() < np.ceil(label.box[3])

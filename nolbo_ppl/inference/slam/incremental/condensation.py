@@ -7,7 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import inverse
-from nolbo_ppl.inference.slam.graph import GAUGE_SCALE, LOOSE_ROTATION, PRIOR_ROTATION, landmark_key, named_error, pose_key
+from nolbo_ppl.inference.slam.graph import (
+    GAUGE_SCALE,
+    PRIOR_ROTATION,
+    UNINFORMATIVE_ROTATION_SIGMA,
+    landmark_key,
+    named_error,
+    pose_key,
+)
 
 LANDMARK_PRIOR = 1e3
 """Scale of the weak prior that keeps the local system determinate, m."""
@@ -42,7 +49,7 @@ def condensed_observations(
     graph.add(gtsam.PriorFactorPose3(pose_key(anchor), gtsam.Pose3(T_world_camera[anchor]), fixed))
     for i, T in T_world_camera.items():
         values.insert(pose_key(i), gtsam.Pose3(T))
-    weak = gtsam.noiseModel.Diagonal.Sigmas(np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [LANDMARK_PRIOR] * 3))
+    weak = gtsam.noiseModel.Diagonal.Sigmas(np.array([PRIOR_ROTATION * UNINFORMATIVE_ROTATION_SIGMA] * 3 + [LANDMARK_PRIOR] * 3))
     for j, T in T_world_landmark.items():
         values.insert(landmark_key(j), gtsam.Pose3(T))
         graph.add(gtsam.PriorFactorPose3(landmark_key(j), gtsam.Pose3(T), weak))

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from nolbo_ppl.geometry.pose import adjoint, inverse
 from nolbo_ppl.inference.slam.graph import (
     GAUGE_SCALE,
-    LOOSE_ROTATION,
     PRIOR_POSITION_RATIO,
     PRIOR_ROTATION,
+    UNINFORMATIVE_ROTATION_SIGMA,
     ObservationFactors,
     SlamEstimate,
     landmark_key,
@@ -32,7 +32,7 @@ from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 
 RELINEARISE_ROTATION, RELINEARISE_POSITION = 0.05, 10.0
 """Changes in rad and m beyond which a variable is linearised anew."""
-LEAST_WEIGHT = 1e-3
+MIN_WEIGHT = 1e-3
 """Observations of lower weight are left out."""
 GAUGE, PRIOR, STEP, OBSERVATION = range(4)
 """Kinds of factors: of a first pose, of a landmark, between poses, of a landmark from a pose."""
@@ -151,7 +151,7 @@ class IncrementalGraph:
     def add_landmark(self, T_world_landmark: Float[np.ndarray, "4 4"], distance: float) -> int:
         """A new landmark with its weak prior; returns its number."""
         self.first_values[landmark_key(self.landmarks)] = T_world_landmark
-        sigmas = np.array([PRIOR_ROTATION * LOOSE_ROTATION] * 3 + [PRIOR_POSITION_RATIO * max(distance, 1e-3)] * 3)
+        sigmas = np.array([PRIOR_ROTATION * UNINFORMATIVE_ROTATION_SIGMA] * 3 + [PRIOR_POSITION_RATIO * max(distance, 1e-3)] * 3)
         self.add(Factor(PRIOR, self.landmarks, -1, T_world_landmark, np.diag(sigmas**2)))
         self.landmarks += 1
         return self.landmarks - 1
@@ -178,7 +178,7 @@ class IncrementalGraph:
         return estimate.T_world_landmark
 
     def _add_observations(self, found: ObservationFactors, frame: int, landmarks: list[int]) -> None:
-        for k in np.flatnonzero(found.weight > LEAST_WEIGHT):
+        for k in np.flatnonzero(found.weight > MIN_WEIGHT):
             j, covariance = landmarks[int(found.landmark[k])], found.covariance[k] / found.weight[k]
             self.add(Factor(OBSERVATION, frame, j, found.T_camera_landmark[k], covariance))
 
@@ -201,7 +201,7 @@ class IncrementalGraph:
             if not agree:
                 covariance = covariance.copy()
                 covariance[:3], covariance[:, :3] = 0.0, 0.0
-                covariance[:3, :3] = LOOSE_ROTATION**2 * np.eye(3)
+                covariance[:3, :3] = UNINFORMATIVE_ROTATION_SIGMA**2 * np.eye(3)
             self.add(Factor(OBSERVATION, factor.a, b, factor.T @ T_a_b, covariance))
         self.first_values.pop(landmark_key(a), None)
 

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import skew
-from nolbo_ppl.inference.slam.consistent_cliques import find_closing
+from nolbo_ppl.inference.slam.consistent_cliques import find_loop_closure
 from nolbo_ppl.inference.slam.em import link_arrays, soft_assignment
-from nolbo_ppl.inference.slam.graph import LOOSE_ROTATION, SlamEstimate
+from nolbo_ppl.inference.slam.graph import UNINFORMATIVE_ROTATION_SIGMA, SlamEstimate
 from nolbo_ppl.inference.slam.incremental.drift_graph import DriftGraph
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, landmark_features
@@ -29,7 +29,7 @@ from nolbo_ppl.inference.slam.loop_candidates import (
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 from nolbo_ppl.inference.slam.slam_state import link_scale, object_log_density
 
-SURE = 0.9
+SURE_WEIGHT = 0.9
 """Associations above this weight are made online; the rest waits for more detections, or for the end."""
 SOLVE_INTERVAL = 10
 """Keyframes between two solves for closed loops: what is found sooner waits."""
@@ -211,7 +211,7 @@ class LoopCloser:
         links = link_arrays(T[:, :3, :3], features, pairs[:, 0], pairs[:, 1], np.ones(len(pairs)), floor)
         for k, (i, j) in enumerate(found):
             both = features.oriented[i] and features.oriented[j] and features.symmetry[i] != 0 and features.symmetry[j] != 0
-            agree = not both or links.scale[k, 0] < LOOSE_ROTATION
+            agree = not both or links.scale[k, 0] < UNINFORMATIVE_ROTATION_SIGMA
             self.waiting.append(Merge(near[i], near[j], links.T_a_b[k], bool(agree)))
             a, b = self.map.landmarks[near[i]], self.map.landmarks[near[j]]
             self.drift.close(a.place, b.place, T[j, :3, 3], 2 * floor)
@@ -302,7 +302,7 @@ def find_merges(
     """Fresh landmarks that are older ones: a constellation when one passes, then single ones that are sure."""
     estimate = SlamEstimate(np.zeros((0, 4, 4)), T_world_landmark)
     outside = pairs.select(~np.isin(pairs.b, fresh))
-    closing = find_closing(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=log_new)
+    closing = find_loop_closure(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=log_new)
     found: list[tuple[int, int]] = []
     least = config.constellation_log_odds
     if closing and closing.log_odds > least and closing.margin > least / 2:
@@ -312,7 +312,7 @@ def find_merges(
     if len(rest):
         a, b, weight, _ = soft_assignment(rest, features, np.arange(len(features.first)), log_new, config)
         for k in np.argsort(-weight, kind="stable"):
-            if weight[k] > SURE and int(a[k]) not in used and int(b[k]) not in used:
+            if weight[k] > SURE_WEIGHT and int(a[k]) not in used and int(b[k]) not in used:
                 found.append((int(a[k]), int(b[k])))
                 used += found[-1]
     return found

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from nolbo_ppl.inference.slam.class_posterior import class_posterior, fit_confusion
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
-from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, told_variance
+from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, stated_variance
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.structures.landmark import Landmark
 
@@ -34,7 +34,7 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
     landmarks = [running.landmarks[j] for j in running.numbers.tolist()]
     if not landmarks:
         return ()
-    variance: Float[np.ndarray, "m d"] = told_variance(landmarks, config.latent_correlation or 0.0)
+    variance: Float[np.ndarray, "m d"] = stated_variance(landmarks, config.latent_correlation or 0.0)
     classes = class_posteriors(landmarks, running.prior)
     out = []
     for row, landmark in enumerate(landmarks):

@@ -24,7 +24,7 @@ from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel
 from nolbo_ppl.inference.slam.slam_state import link_scale
 
-FRAMES_KEPT = 64
+MAX_FRAMES = 64
 """Newest frames of a landmark that are kept, to tell which landmarks were seen together."""
 RIGHT_TRACK = 0.95
 """Probability that a detection was put to the right landmark; a stray one cannot sink it."""
@@ -66,7 +66,7 @@ class RunningLandmark:
     """Log ratio of its detections as those of an object to those of background, its position aside."""
     information: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """Sum of the information of its detections in the world frame, m^-2."""
-    frames: deque[int] = field(default_factory=lambda: deque(maxlen=FRAMES_KEPT))
+    frames: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_FRAMES))
     """Newest frames it was detected in."""
     passes: int = 1
     """Tracks it was made of."""
@@ -99,7 +99,7 @@ class RunningLandmark:
         self.size, self.sizes = self.size + other.size, self.sizes + other.sizes
         self.log_odds += other.log_odds
         self.information = self.information + other.information
-        self.frames = deque(sorted({*self.frames, *other.frames})[-FRAMES_KEPT:], maxlen=FRAMES_KEPT)
+        self.frames = deque(sorted({*self.frames, *other.frames})[-MAX_FRAMES:], maxlen=MAX_FRAMES)
         self.passes += other.passes
 
     def together_with(self, other: RunningLandmark) -> bool:
@@ -157,7 +157,7 @@ def count_detections(
         landmark.information = landmark.information + more[k]
 
 
-def told_variance(landmarks: list[RunningLandmark], correlation: float) -> Float[np.ndarray, "m d"]:
+def stated_variance(landmarks: list[RunningLandmark], correlation: float) -> Float[np.ndarray, "m d"]:
     """Variances of their latents with the correlation of views; LARGE_VARIANCE where none was observed."""
     variance = np.array([j.latent_variance for j in landmarks])
     variance = np.where(variance < 0.5 * LARGE_VARIANCE, variance, LARGE_VARIANCE)
@@ -177,7 +177,7 @@ def landmark_features(
     """
     numbers = {j.number for j in landmarks}
     everyone = landmarks + [j for j in others if j.number not in numbers]
-    variance = told_variance(everyone, correlation)
+    variance = stated_variance(everyone, correlation)
     rarity = log_population(np.array([j.latent for j in everyone]), variance, fresh)
     count = len(landmarks)
     return TrackletFeatures(

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.graph import (
-    LOOSE_ROTATION,
+    UNINFORMATIVE_ROTATION_SIGMA,
     ObservationFactors,
-    add_links,
+    add_landmark_equalities,
     linearise,
 )
 from nolbo_ppl.inference.slam.slam_state import SlamState, measured_graph
@@ -50,7 +50,7 @@ class FittedResiduals:
 def whole_graph(state: SlamState) -> tuple[gtsam.NonlinearFactorGraph, ObservationFactors]:
     """Odometry, detections, priors and links of a state, in this order, and the detections' factors."""
     graph, factors = measured_graph(state)
-    add_links(graph, state.links, state.config.robust_width)
+    add_landmark_equalities(graph, state.links, state.config.robust_width)
     return graph, factors
 
 
@@ -70,7 +70,7 @@ def fitted_residuals(state: SlamState, rng: np.random.Generator, count: int = SA
     sure = factors.weight[kept] > 0.5
     rotation = factors.covariance[kept][:, [0, 1, 2], [0, 1, 2]]
     residual = linearisation.residual[middle:end].reshape(-1, 6)
-    oriented = rotation < (0.3 * LOOSE_ROTATION) ** 2
+    oriented = rotation < (0.3 * UNINFORMATIVE_ROTATION_SIGMA) ** 2
     residual[:, :3] *= oriented
     return FittedResiduals(
         linearisation.residual[6:middle].reshape(-1, 6),

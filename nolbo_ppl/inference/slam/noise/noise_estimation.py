@@ -28,7 +28,7 @@ TOO_SMALL = 1.35
 """A stated scale is called too small when normalised residuals are this wide."""
 SURE_GAIN = 8.0
 """And when this width is more probable than the stated one by as many nats."""
-LEAST_PAIRS = 5
+MIN_PAIRS = 5
 """Fewer pairs of one object than this tell no scale."""
 NEAREST = 6
 """Earlier detections looked at for each later one."""
@@ -36,7 +36,7 @@ LARGEST_FRAME = 500
 """Detections of one frame looked at."""
 BALL = 5.0
 """Radius, in widths, within which gaps of one object are told from those of strangers."""
-LEAST_RANGE_PART = 1e-4
+MIN_RANGE_PART = 1e-4
 """Least estimated scale of a position, as a part of the median range: detections of a simulator have none."""
 
 
@@ -101,11 +101,11 @@ def same_or_stranger(squared: Float[np.ndarray, " p"], dimension: int = 3) -> tu
     """
     length = np.sqrt(np.maximum(squared, 0.0))
     none = np.zeros(len(length))
-    if len(length) < LEAST_PAIRS:
+    if len(length) < MIN_PAIRS:
         return float("nan"), 0.0, none
     ordered = np.sort(length)
     floor = max(1e-9 * float(ordered[-1]), 1e-150)
-    start, end = max(float(ordered[LEAST_PAIRS - 1]), floor), max(float(np.median(ordered)) * BALL, 2 * floor)
+    start, end = max(float(ordered[MIN_PAIRS - 1]), floor), max(float(np.median(ordered)) * BALL, 2 * floor)
     for ball in np.geomspace(start, max(end, start), 16):
         fit = _peak(ordered, float(ball), dimension)
         if fit is None:
@@ -131,7 +131,7 @@ def same_or_stranger(squared: Float[np.ndarray, " p"], dimension: int = 3) -> tu
 def _peak(ordered: np.ndarray, ball: float, dimension: int) -> tuple[float, float, float] | None:
     """Width and share of the peak in a ball, and the ball; None where nothing stands out of what fills it evenly."""
     x = ordered[: np.searchsorted(ordered, ball, side="right")]
-    if len(x) < LEAST_PAIRS:
+    if len(x) < MIN_PAIRS:
         return None
     width, share = 0.2 * ball, 0.5
     for _ in range(80):
@@ -142,7 +142,7 @@ def _peak(ordered: np.ndarray, ball: float, dimension: int) -> tuple[float, floa
         before, width = width, max(float(np.sqrt((responsibility @ x**2) / max(total, 1e-12) / dimension)), 1e-9 * ball)
         if abs(width - before) < 1e-4 * before:
             break
-    if width > ball / 3 or share * len(x) < LEAST_PAIRS:
+    if width > ball / 3 or share * len(x) < MIN_PAIRS:
         return None
     gain = _log_mixture(x, width, share, ball, dimension) - _log_components(x, width, ball, dimension)[1].sum()
     return (width, share, ball) if gain > SURE_GAIN else None
@@ -252,7 +252,7 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     Odometry scales nobody stated start from defaults here and are refined on the graph (`refine_odometry`).
     """
     table = problem.observations
-    rotation_step, translation_step, correlation = step_scales(problem, config)
+    rotation_step, translation_step, correlation = step_sigmas(problem, config)
     pairs = consecutive_pairs(problem, (rotation_step, translation_step))
     report: dict[str, float] = {"pairs": float(len(pairs.first))}
     warnings: list[str] = []
@@ -278,14 +278,14 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     )
 
 
-def step_scales(
+def step_sigmas(
     problem: SlamProblem, config: SlamConfig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 6 6"] | None]:
     """Scales of each step, and its covariance in units of them where the problem states it."""
     covariance = problem.odometry_covariance
     if covariance is None:
         length = np.linalg.norm(np.diff(problem.odometry[:, :3, 3], axis=0), axis=1)
-        return *odometry_scales(length, config), None
+        return *odometry_sigmas(length, config), None
     rotation, translation = (
         np.sqrt(np.trace(covariance[:, part, part], axis1=1, axis2=2) / 3) for part in (slice(3), slice(3, 6))
     )
@@ -296,7 +296,7 @@ def step_scales(
     return rotation, translation, correlation
 
 
-def odometry_scales(
+def odometry_sigmas(
     length: Float[np.ndarray, " n"], config: SlamConfig
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Scales of each step from the configuration: a constant and a part that grows with the step, added as variances."""
@@ -339,7 +339,7 @@ def _position_covariance(
         lateral, radial = a_lateral + b_lateral * distance, a_radial + b_radial * distance
     else:
         lateral = radial = 0.05 * distance + 1e-3
-    floor = LEAST_RANGE_PART * max(float(np.median(distance)) if len(distance) else 1.0, 1e-3)
+    floor = MIN_RANGE_PART * max(float(np.median(distance)) if len(distance) else 1.0, 1e-3)
     estimated = ray_covariance(table.position, np.maximum(lateral, floor), np.maximum(radial, floor))
     covariance = np.where(given[:, None, None], np.nan_to_num(table.position_covariance), estimated)
     ratio, gain = pairs.ratio_to_stated

@@ -8,7 +8,7 @@ import numpy as np
 
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.noise.fitted_residuals import squared_ratio
-from nolbo_ppl.inference.slam.noise.noise_estimation import SURE_GAIN, TOO_SMALL, step_scales
+from nolbo_ppl.inference.slam.noise.noise_estimation import SURE_GAIN, TOO_SMALL, step_sigmas
 from nolbo_ppl.inference.slam.noise.scale_evidence import ScaleEvidence, scale_evidence, scale_posterior
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -21,19 +21,19 @@ LARGEST_WINDOW = 400
 """The same for the map at the end, loops closed."""
 STATED_GRID = np.log(4.0) * np.arange(0, 11)
 """The same for stated ones, which are only ever raised: a covariance of 1e-12 is a scale 4 000 times too small."""
-LEAST_TOLD = 10.0
+MIN_STATED = 10.0
 """Steps' worth of information below which residuals over the posterior change no scale."""
 LARGEST_CHANGE = 4.0
 """Largest factor on a scale in one update."""
-LEAST_SUPPORT = 2.0
+MIN_SUPPORT = 2.0
 """A correction of the odometry must gain as much log evidence over an odometry without noise, nats."""
 NO_NOISE = 1 / 64
 """Factor on the default scales that stands for an odometry without noise."""
-WELL_TOLD = 30.0
+WELL_STATED = 30.0
 """Steps' worth of information below which a scale nobody stated is called a guess."""
 
 
-def stated_scales(problem: SlamProblem, config: SlamConfig) -> tuple[bool, bool]:
+def stated_sigmas(problem: SlamProblem, config: SlamConfig) -> tuple[bool, bool]:
     """Whether the user stated the rotation and the translation scale."""
     if problem.odometry_covariance is not None:
         return True, True
@@ -85,7 +85,7 @@ def odometry_by_evidence(state: SlamState) -> SlamState:
     Before loops close the evidence often bounds a scale from above alone. The one in use is then a standard deviation above
     the posterior's mean: too wide a drift is annealed away as loops close, too narrow a one closes none.
     """
-    free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
+    free = (not stated_sigmas(state.problem, state.config)[0], not stated_sigmas(state.problem, state.config)[1])
     window = densest_window(state)
     if not any(free) or len(window.rows) < 20 or len(window.problem) < 10:
         return state
@@ -184,11 +184,11 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     """The scales the answer is given with, and factors on them for the trajectory: what nothing supports is not corrected.
 
     A scale that the closed map still does not tell is the posterior's mean of the tracks. Then the evidence is compared with
-    that of an odometry without noise, for rotations, translations and both: where it gains less than `LEAST_SUPPORT` the
+    that of an odometry without noise, for rotations, translations and both: where it gains less than `MIN_SUPPORT` the
     trajectory keeps the odometry's own steps, so that good odometry is not bent by poor detections; the covariances keep the
     scale. Where scales are guesses a warning says so, and how far half and twice of them would move the trajectory.
     """
-    free = (not stated_scales(state.problem, state.config)[0], not stated_scales(state.problem, state.config)[1])
+    free = (not stated_sigmas(state.problem, state.config)[0], not stated_sigmas(state.problem, state.config)[1])
     if len(state.problem) < 3 or not len(state.rows):
         return state, (1.0, 1.0)
     if not all(free):
@@ -200,7 +200,7 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     told = [report.get(f"odometry_{name}_told", 0.0) for name in names]
     back = np.array(
         [
-            np.exp(-report.pop(f"odometry_{name}_log_spread", 0.0)) if is_free and t < LEAST_TOLD else 1.0
+            np.exp(-report.pop(f"odometry_{name}_log_spread", 0.0)) if is_free and t < MIN_STATED else 1.0
             for name, is_free, t in zip(names, free, told)
         ]
     )
@@ -209,7 +209,7 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     if len(window.problem) < 3 or not len(window.rows):
         return state, (1.0, 1.0)
     evidence = scale_evidence(window)
-    default = step_scales(state.problem, state.config)
+    default = step_sigmas(state.problem, state.config)
     least = [
         min(NO_NOISE * float(np.median(d) / np.median(used)), 1.0)
         for d, used in zip(default[:2], (state.noise.rotation_step, state.noise.translation_step))
@@ -218,10 +218,10 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     values = np.array([evidence.solve(a, b)[0] for a, b in choices])
     # The choice that keeps most of the odometry among those that nothing speaks against.
     chosen = max(
-        (k for k in range(len(choices)) if values[k] > values.max() - LEAST_SUPPORT),
+        (k for k in range(len(choices)) if values[k] > values.max() - MIN_SUPPORT),
         key=lambda k: ((choices[k][0] < 1) + (choices[k][1] < 1), values[k]),
     )
-    guesses = [name for name, is_free, t in zip(names, free, told) if is_free and t < WELL_TOLD]
+    guesses = [name for name, is_free, t in zip(names, free, told) if is_free and t < WELL_STATED]
     if guesses:
         report = dict(state.noise.report)
         landmarks, poses = len(window.static), len(window.problem)
@@ -242,7 +242,7 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
 def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState:
     """One update of the odometry's scales to the fixed point of the evidence: `sigma^2 <- sigma^2 sum r^2 / sum E[r^2]`.
 
-    Scales nobody stated go up and down where `LEAST_TOLD` steps tell them. Stated ones stay unless they are too small by more
+    Scales nobody stated go up and down where `MIN_STATED` steps tell them. Stated ones stay unless they are too small by more
     than a third (reported, and raised with `correct_scales`).
     """
     if len(state.problem) < 3 or not len(state.rows):
@@ -253,10 +253,10 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
     for axis, name in enumerate(("rotation", "translation")):
         squared, told = ratios[axis]
         report[f"odometry_{name}_told"] = told
-        if told < LEAST_TOLD:
+        if told < MIN_STATED:
             continue
         ratio = float(np.clip(np.sqrt(squared), 1 / LARGEST_CHANGE, LARGEST_CHANGE))
-        if not stated_scales(state.problem, state.config)[axis]:
+        if not stated_sigmas(state.problem, state.config)[axis]:
             factors[axis] = ratio
         elif ratio > TOO_SMALL:
             text = f"stated odometry {name} scale is too small: residuals are {ratio:.2f} times as wide"

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.noise.fitted_residuals import block_ratio, fitted_residuals, halves_of_tracks, robust_width
-from nolbo_ppl.inference.slam.noise.noise_estimation import LEAST_RANGE_PART, TOO_SMALL, robust_scale
+from nolbo_ppl.inference.slam.noise.noise_estimation import MIN_RANGE_PART, TOO_SMALL, robust_scale
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 LARGEST_FACTOR = 20.0
 """Most that correlation may widen covariances."""
-LEAST_FACTOR = 0.05
+MIN_FACTOR = 0.05
 """Least factor on a scale nobody stated."""
 UNSTATED_FACTOR, UNSTATED_ROTATION_FACTOR = 4.0, 16.0
 """What correlated errors are expected to cost where nobody stated a scale: detectors are biased by view, most of all in
@@ -28,7 +28,7 @@ PRIOR_BLOCKS = 8.0
 """Weight of this prior, in halves of tracks."""
 POOR_DEPTH = 1.5
 """Depth this many times as noisy as directions is that of a camera: then it is biased as well, and its factor grows."""
-LEAST_DETECTIONS = 30
+MIN_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
 
@@ -64,7 +64,7 @@ def calibrate(state: SlamState) -> SlamState:
     stated, rotation_stated = position_stated(state), np.isfinite(state.problem.observations.rotation_scale)
     rotation_stated |= config.rotation_scale is not None
     along = unstated_range_factor(noise.report, state.typical_range)
-    if len(state.rows) < LEAST_DETECTIONS:
+    if len(state.rows) < MIN_DETECTIONS:
         if not stated[state.rows].any():
             noise = replace(noise, position_factor=UNSTATED_FACTOR, range_factor=along, rotation_factor=UNSTATED_ROTATION_FACTOR)
         return replace(state, noise=noise)
@@ -73,14 +73,14 @@ def calibrate(state: SlamState) -> SlamState:
     rows = state.rows[found.row]
     block = halves_of_tracks(state.tracklets.of_observation[rows], state.problem.observations.frame[rows])
     position, expected = found.observation[:, 3:], found.observation_expected[:, 3:]
-    if len(rows) >= LEAST_DETECTIONS:
+    if len(rows) >= MIN_DETECTIONS:
         # The graph's covariances hold the factors in use; what is measured is relative to them.
         used = (noise.position_factor**2 * noise.range_factor) ** (1 / 3)
         ratio = _width(position, expected) * np.sqrt(used)
         report["position_track_width"] = ratio
         change = _change(ratio, "position", stated[rows], config.correct_scales, warnings)
         covariance = noise.position_covariance * np.where(stated, change[0], change[1])[:, None, None] ** 2
-        floor = (LEAST_RANGE_PART * state.typical_range) ** 2 * np.eye(3)
+        floor = (MIN_RANGE_PART * state.typical_range) ** 2 * np.eye(3)
         covariance = np.where(stated[:, None, None], covariance, covariance + floor)
         measured, blocks = block_ratio(position, expected, block)
         # Widths of single residuals are given to the scale; what is left of the sums is correlation.
@@ -91,12 +91,12 @@ def calibrate(state: SlamState) -> SlamState:
             factor, along_factor = (shrunk_factor(measured, blocks, prior) for prior in (UNSTATED_FACTOR, along))
         noise = replace(noise, position_covariance=covariance, position_factor=factor, range_factor=along_factor)
     whole = found.oriented.any(axis=1)
-    if whole.sum() >= LEAST_DETECTIONS:
+    if whole.sum() >= MIN_DETECTIONS:
         turn, turn_expected = found.observation[whole, :3], found.observation_expected[whole, :3]
         axes = found.oriented[whole]
         used = noise.rotation_factor
         widths = [
-            _width(turn[axes[:, c], c], turn_expected[axes[:, c], c]) for c in range(3) if axes[:, c].sum() >= LEAST_DETECTIONS
+            _width(turn[axes[:, c], c], turn_expected[axes[:, c], c]) for c in range(3) if axes[:, c].sum() >= MIN_DETECTIONS
         ]
         ratio = max(widths, default=float("nan")) * np.sqrt(used)
         if np.isfinite(ratio):
@@ -123,7 +123,7 @@ def latent_width(state: SlamState) -> float:
     track = state.tracklets.of_observation[rows]
     count = np.bincount(track[track >= 0], minlength=len(state.tracklets)) if len(rows) else np.zeros(0, int)
     rows = rows[(track >= 0) & (count[track] >= 2)]
-    if len(rows) < LEAST_DETECTIONS:
+    if len(rows) < MIN_DETECTIONS:
         return float("nan")
     track = np.unique(state.tracklets.of_observation[rows], return_inverse=True)[1]
     latent, scale = state.problem.observations.latent[rows], state.noise.latent_scale[rows]
@@ -142,7 +142,7 @@ def _change(ratio: float, name: str, stated: Int[np.ndarray, " k"], correct: boo
     """Factors on stated and on unstated scales for residuals this wide, with a word where stated ones are wrong."""
     if not np.isfinite(ratio):
         return 1.0, 1.0
-    free = max(ratio, LEAST_FACTOR)
+    free = max(ratio, MIN_FACTOR)
     if not stated.any():
         return 1.0, free
     raised = [w for w in warnings if w.startswith(f"stated {name} scales are too small: gaps between frames")]

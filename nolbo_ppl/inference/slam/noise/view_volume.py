@@ -9,7 +9,7 @@ from nolbo_ppl.structures.detections import Detections
 
 FLAT_WORLD = 0.1
 """Least thickness of the observed space, as a part of its extent: a density per m^3 of a plane is no rate."""
-LEAST_REACH = 0.25
+MIN_REACH = 0.25
 """Least standard deviation of where detections come from, as a part of their range: a camera that circles one object sees it at
 one and the same place, which says nothing of false detections falling just there."""
 
@@ -24,8 +24,8 @@ def view_volume(table: Detections) -> float:
 
 
 def widening(position: Float[np.ndarray, "n 3"]) -> float:
-    """Factor, 1 or more, that brings the largest spread of positions in the camera frame to `LEAST_REACH` of their range."""
+    """Factor, 1 or more, that brings the largest spread of positions in the camera frame to `MIN_REACH` of their range."""
     if len(position) < 2:
         return 1.0
     largest = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(position.T))[-1], 0.0)))
-    return max(1.0, LEAST_REACH * float(np.linalg.norm(position, axis=1).mean()) / max(largest, 1e-3))
+    return max(1.0, MIN_REACH * float(np.linalg.norm(position, axis=1).mean()) / max(largest, 1e-3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.geometry.pose import se3_exp, skew
-from nolbo_ppl.inference.slam.graph import widened
+from nolbo_ppl.inference.slam.graph import inflated
 from nolbo_ppl.inference.slam.incremental import drift_graph as drift
 from nolbo_ppl.inference.slam.incremental.drift_graph import DriftGraph
 from nolbo_ppl.inference.slam.noise.residual_calibration import unstated_range_factor
@@ -118,7 +118,7 @@ def test_nodes_stay_few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_covariances_widen_along_and_across_the_ray() -> None:
     position = np.array([[0.0, 0.0, 4.0], [3.0, 0.0, 0.0]])
-    wide = widened(np.tile(np.eye(3), (2, 1, 1)), position, 4.0, 9.0)
+    wide = inflated(np.tile(np.eye(3), (2, 1, 1)), position, 4.0, 9.0)
     np.testing.assert_allclose(wide, [np.diag([4.0, 4.0, 9.0]), np.diag([9.0, 4.0, 4.0])], atol=1e-12)
 
 

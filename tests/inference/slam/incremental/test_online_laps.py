@@ -5,25 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.slam import IncrementalSlam, OnlineInfo, SlamConfig, SlamProblem, solve_online
+from nolbo_ppl.inference.slam import IncrementalInfo, IncrementalSlam, SlamConfig, SlamProblem, solve_incremental
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
-from nolbo_ppl.structures.detections import Detections, make_table
+from nolbo_ppl.structures.detections import Detections
 
 LAPS, PER_LAP, OBJECTS = 4, 50, 20
 CONFIG = SlamConfig(odometry_rotation_scale=0.004, odometry_translation_ratio=0.01)
 
 
 def empty_table() -> Detections:
-    return make_table(np.zeros(0, int), np.zeros((0, 3)))
+    return Detections.from_arrays(np.zeros(0, int), np.zeros((0, 3)))
 
 
 def circuit() -> SimulatedSequence:
     rng = np.random.default_rng(1)
     truth = simulate_circuit(rng, laps=LAPS, radius=20.0, frames_per_lap=PER_LAP)
-    return simulate_drive(truth, rng, world=WorldConfig(objects=OBJECTS, categories=5, latent_dim=4))
+    return simulate_sequence(truth, rng, world=WorldConfig(objects=OBJECTS, categories=5, latent_dim=4))
 
 
 def start(drive: SimulatedSequence, keyframes: KeyframeConfig | None = None) -> IncrementalSlam:
@@ -31,13 +31,13 @@ def start(drive: SimulatedSequence, keyframes: KeyframeConfig | None = None) -> 
     return IncrementalSlam(CONFIG, SlamProblem(drive.odometry[:PER_LAP], first), keyframes)
 
 
-def feed(slam: IncrementalSlam, drive: SimulatedSequence, first: int, last: int) -> list[OnlineInfo]:
+def feed(slam: IncrementalSlam, drive: SimulatedSequence, first: int, last: int) -> list[IncrementalInfo]:
     table = drive.observations
     return [slam.update(drive.odometry[t], table.select(table.frame == t)) for t in range(first, last)]
 
 
 @pytest.fixture(scope="module")
-def driven() -> tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]]:
+def driven() -> tuple[SimulatedSequence, IncrementalSlam, list[IncrementalInfo], list[int]]:
     drive = circuit()
     slam = start(drive, KeyframeConfig(passes=2))
     infos, factors = [], []
@@ -48,7 +48,7 @@ def driven() -> tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list
 
 
 def test_one_landmark_an_object_and_no_growth(
-    driven: tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]],
+    driven: tuple[SimulatedSequence, IncrementalSlam, list[IncrementalInfo], list[int]],
 ) -> None:
     drive, slam, infos, factors = driven
     objects = len(np.unique(drive.object_of[drive.object_of >= 0]))
@@ -63,7 +63,7 @@ def test_one_landmark_an_object_and_no_growth(
 
 
 def test_the_trajectory_is_corrected_while_driving(
-    driven: tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]],
+    driven: tuple[SimulatedSequence, IncrementalSlam, list[IncrementalInfo], list[int]],
 ) -> None:
     drive, slam, infos, _ = driven
     before = absolute_trajectory_error(drive.odometry, drive.truth).rmse
@@ -78,7 +78,7 @@ def test_the_trajectory_is_corrected_while_driving(
 
 
 def test_the_map_answers_at_any_keyframe(
-    driven: tuple[SimulatedSequence, IncrementalSlam, list[OnlineInfo], list[int]],
+    driven: tuple[SimulatedSequence, IncrementalSlam, list[IncrementalInfo], list[int]],
 ) -> None:
     drive, slam, _, _ = driven
     landmarks = slam.landmarks()
@@ -113,7 +113,7 @@ def test_one_keyframe_and_none() -> None:
     for ask in (slam.landmarks, slam.trajectory, slam.finish):
         with pytest.raises(InputError, match="no keyframe"):
             ask()
-    slam.update(np.eye(4), make_table([0], np.array([[0.0, 0.0, 5.0]])))
+    slam.update(np.eye(4), Detections.from_arrays([0], np.array([[0.0, 0.0, 5.0]])))
     assert slam.landmarks() == () and slam.trajectory().shape == (1, 4, 4)
     result = slam.finish()
     assert np.isfinite(result.T_world_camera).all()
@@ -154,8 +154,8 @@ def test_covariances_for_all_steps_or_for_none() -> None:
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_a_drive_of_one_or_two_frames_has_an_answer_without_nan(frames: int) -> None:
-    table = make_table(np.zeros(2, int), np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 8.0]]))
-    result = solve_online(SlamProblem(np.tile(np.eye(4), (frames, 1, 1)), table))
+    table = Detections.from_arrays(np.zeros(2, int), np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 8.0]]))
+    result = solve_incremental(SlamProblem(np.tile(np.eye(4), (frames, 1, 1)), table))
     assert np.isfinite(result.T_world_camera).all()
     scales = [v for v in vars(result.state.config).values() if isinstance(v, float)]
     assert np.isfinite(scales).all()

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.inference.slam.initialise import init
 from nolbo_ppl.inference.slam.noise.absurd_values import MOST_MODES, without_absurd_values
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
-from nolbo_ppl.structures.detections import make_table
+from nolbo_ppl.structures.detections import Detections
 
 
 def detections(n: int = 60, latent: np.ndarray | None = None, **more: Any) -> SlamProblem:
     rng = np.random.default_rng(0)
     z = rng.standard_normal((n, 3)) if latent is None else latent
-    table = make_table(np.arange(n), rng.uniform(2, 8, (n, 3)), latent=z, latent_scale=0.5, **more)
+    table = Detections.from_arrays(np.arange(n), rng.uniform(2, 8, (n, 3)), latent=z, latent_scale=0.5, **more)
     return SlamProblem(np.tile(np.eye(4), (n, 1, 1)), table)
 
 
@@ -47,7 +47,9 @@ def test_modes_are_bounded() -> None:
     n, count = 5, 40
     weight = np.random.default_rng(2).dirichlet(np.ones(count), n)
     R = np.tile(np.eye(3), (n, count, 1, 1))
-    table = make_table(np.arange(n), np.ones((n, 3)), mode_weight=weight, mode_rotation=R, mode_std=np.full((n, count), 0.1))
+    table = Detections.from_arrays(
+        np.arange(n), np.ones((n, 3)), mode_weight=weight, mode_rotation=R, mode_std=np.full((n, count), 0.1)
+    )
     cleaned, warnings = without_absurd_values(SlamProblem(np.tile(np.eye(4), (n, 1, 1)), table))
     kept = cleaned.observations.mode_weight
     assert kept.shape == (n, MOST_MODES) and "40 modes" in warnings[0]
@@ -83,7 +85,7 @@ def test_good_odometry_is_not_bent_by_poor_detections() -> None:
     """0.2 mrad and 0.1 % a step under a detector of 1 m and 20 % of the range, no scale of the odometry stated."""
     rng = np.random.default_rng(11)
     truth = simulate_circuit(rng, laps=1, radius=20.0, frames_per_lap=60)
-    world = simulate_drive(
+    world = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=30, categories=6, latent_dim=4),

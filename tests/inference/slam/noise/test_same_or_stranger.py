@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise, fit_range_model, robust_scale, same_or_stranger
-from nolbo_ppl.structures.detections import make_table
+from nolbo_ppl.structures.detections import Detections
 
 
 @pytest.mark.parametrize(("width", "same", "strangers"), [(1.0, 300, 0), (1.0, 300, 900), (3.0, 150, 600), (0.2, 150, 600)])
@@ -39,7 +39,7 @@ def test_exact_detections_have_a_floor() -> None:
     assert fit_range_model(rng.uniform(1, 10, 200), np.zeros(200)) == (0.0, 0.0)
     odometry = np.tile(np.eye(4), (60, 1, 1))
     objects = rng.uniform(2, 8, (5, 3))
-    table = make_table(np.repeat(np.arange(60), 5), np.tile(objects, (60, 1)))
+    table = Detections.from_arrays(np.repeat(np.arange(60), 5), np.tile(objects, (60, 1)))
     noise = estimate_noise(SlamProblem(odometry, table), SlamConfig())
     scale = np.sqrt(np.linalg.eigvalsh(noise.position_covariance))
     assert np.isfinite(scale).all() and (scale > 1e-5).all() and (scale < 1e-2).all()
@@ -51,7 +51,7 @@ def test_exactly_stated_scales_stay(miss: float, clutter: float) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         truth = simulate_circuit(rng, laps=1, frames_per_lap=90)
-        world = simulate_drive(
+        world = simulate_sequence(
             truth,
             rng,
             world=WorldConfig(objects=45, categories=8, latent_dim=6),

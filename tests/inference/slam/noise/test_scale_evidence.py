@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.inference.slam.graph import linearise
 from nolbo_ppl.inference.slam.noise.fitted_residuals import block_ratio, fitted_residuals, halves_of_tracks, whole_graph
@@ -19,7 +19,7 @@ from nolbo_ppl.inference.slam.slam_state import SlamState
 def solved(seed: int = 0, frames: int = 40, rotation: float = 0.01, config: SlamConfig | None = None) -> SlamState:
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, laps=1, radius=12.0, frames_per_lap=frames)
-    world = simulate_drive(
+    world = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=30, categories=4, latent_dim=0),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nolbo_ppl.inference.slam.noise.view_volume import FLAT_WORLD, LEAST_REACH, view_volume, widening
+from nolbo_ppl.inference.slam.noise.view_volume import FLAT_WORLD, MIN_REACH, view_volume, widening
 from nolbo_ppl.structures.detections import Detections
 
 
@@ -34,6 +34,6 @@ def test_a_flat_world_is_as_thick_as_a_part_of_its_extent() -> None:
 def test_detections_at_one_place_come_from_no_less_than_a_part_of_their_range() -> None:
     near = np.array([0.0, 0.0, 8.0]) + np.random.default_rng(0).normal(0, 0.1, (500, 3))
     largest = np.sqrt(np.linalg.eigvalsh(np.cov(near.T))[-1])
-    assert widening(near) * largest == pytest.approx(LEAST_REACH * np.linalg.norm(near, axis=1).mean())
+    assert widening(near) * largest == pytest.approx(MIN_REACH * np.linalg.norm(near, axis=1).mean())
     assert widening(10.0 * ball(500, 2)) == 1.0  # seen all around: nothing to widen
     assert widening(near[:1]) == 1.0

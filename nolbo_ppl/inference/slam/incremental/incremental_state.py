@@ -18,18 +18,18 @@ import numpy as np
 from nolbo_ppl.errors import InputError, input_error
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
 from nolbo_ppl.inference.slam.incremental.drift_graph import DriftGraph
+from nolbo_ppl.inference.slam.incremental.incremental_calibration import IncrementalCalibration
 from nolbo_ppl.inference.slam.incremental.incremental_graph import Factor, IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser, Merge
+from nolbo_ppl.inference.slam.incremental.incremental_memory import IncrementalMemory
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
-from nolbo_ppl.inference.slam.incremental.online_calibration import OnlineCalibration
-from nolbo_ppl.inference.slam.incremental.online_memory import OnlineMemory
-from nolbo_ppl.inference.slam.incremental.running_map import FRAMES_KEPT, RunningLandmark, RunningMap
+from nolbo_ppl.inference.slam.incremental.running_map import MAX_FRAMES, RunningLandmark, RunningMap
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.io.npz import Npz, save_npz
-from nolbo_ppl.structures.detections import ARRAYS, TEXTS, Detections, concatenate
+from nolbo_ppl.structures.detections import ARRAYS, TEXTS, Detections
 
 VERSION = 1
 """Version of the file."""
@@ -53,7 +53,7 @@ DRIFT_NUMBERS = ("stride", "here", "place", "since", "moved_at", "steps")
 MEASUREMENTS = tuple(f.name for f in fields(Measurements) if f.name != "modes")
 
 
-def save_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
+def save_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
     """Write a system that has taken at least one keyframe."""
     if slam.beginning is not None:
         raise input_error("a drive was begun that has no keyframe yet", do="call update first")
@@ -88,7 +88,7 @@ def save_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
     save_npz(path, arrays)
 
 
-def load_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
+def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
     """Put what a file holds into a new system.
 
     Raises:
@@ -113,7 +113,7 @@ def load_state(slam: OnlineMemory, path: str | PathLike[str]) -> None:
                 float(meta["category_error"]),
                 float(meta["objectness_prior"]),
             )
-            slam.scales = OnlineCalibration(slam.config, slam.prior, *(float(v) for v in meta["factors"]))
+            slam.scales = IncrementalCalibration(slam.config, slam.prior, *(float(v) for v in meta["factors"]))
             slam.T_world_camera, slam.last_odometry = (
                 archive.array("T_world_camera", (4, 4)),
                 archive.array("last_odometry", (4, 4)),
@@ -180,21 +180,21 @@ def _get_graph(archive: Npz, meta: dict[str, Any]) -> IncrementalGraph:
 def _put_landmarks(prefix: str, landmarks: list[RunningLandmark], arrays: dict[str, Any]) -> None:
     for name in (*LANDMARK_ARRAYS, *LANDMARK_NUMBERS):
         arrays[f"{prefix}/{name}"] = np.array([getattr(j, name) for j in landmarks])
-    frames = np.full((len(landmarks), FRAMES_KEPT), -1, dtype=np.int64)
+    frames = np.full((len(landmarks), MAX_FRAMES), -1, dtype=np.int64)
     for row, landmark in enumerate(landmarks):
         frames[row, : len(landmark.frames)] = list(landmark.frames)
     arrays[f"{prefix}/frames"] = frames
 
 
 def _get_landmarks(prefix: str, archive: Npz) -> list[RunningLandmark]:
-    frames = archive.array(f"{prefix}/frames", (None, FRAMES_KEPT), kinds="i")
+    frames = archive.array(f"{prefix}/frames", (None, MAX_FRAMES), kinds="i")
     names = (*LANDMARK_ARRAYS, *LANDMARK_NUMBERS)
     columns = {name: archive.array(f"{prefix}/{name}", kinds="fib") for name in names}
     out = []
     for row in range(len(frames)):
         values = {name: columns[name][row].copy() for name in LANDMARK_ARRAYS}
         values |= {name: columns[name][row].item() for name in LANDMARK_NUMBERS}
-        kept = deque(frames[row][frames[row] >= 0].tolist(), maxlen=FRAMES_KEPT)
+        kept = deque(frames[row][frames[row] >= 0].tolist(), maxlen=MAX_FRAMES)
         out.append(RunningLandmark(**values, frames=kept))
     return out
 
@@ -222,7 +222,7 @@ def _put_loops(loops: LoopCloser, arrays: dict[str, Any], meta: dict[str, Any]) 
     arrays["drift/kept"] = np.zeros((0, 6, 0)) if drift.kept is None else drift.kept[1]
 
 
-def _get_loops(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> LoopCloser:
+def _get_loops(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> LoopCloser:
     running = RunningMap(slam.prior)
     landmarks = _get_landmarks("landmark", archive)
     running.landmarks = {j.number: j for j in landmarks}
@@ -251,7 +251,7 @@ def _get_loops(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> LoopCl
 # -- tracks -------------------------------------------------------------------------------------------------------------
 
 
-def _put_tracks(slam: OnlineMemory, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
+def _put_tracks(slam: IncrementalMemory, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
     tracker = slam.tracker
     assert tracker is not None
     for name in TRACKER_ARRAYS:
@@ -275,7 +275,7 @@ def _put_tracks(slam: OnlineMemory, arrays: dict[str, Any], meta: dict[str, Any]
     }
 
 
-def _get_tracks(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> None:
+def _get_tracks(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> None:
     tracker = slam.new_tracker()
     for name in TRACKER_ARRAYS:
         setattr(tracker, name, archive.array(f"tracker/{name}", kinds="fib"))
@@ -297,10 +297,10 @@ def _get_tracks(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> None:
 # -- history ------------------------------------------------------------------------------------------------------------
 
 
-def _put_history(slam: OnlineMemory, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
+def _put_history(slam: IncrementalMemory, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
     if not slam.keyframes.history:
         return
-    table = concatenate(slam.tables)
+    table = Detections.concatenate(slam.tables)
     for name in ARRAYS:
         arrays[f"history/{name}"] = getattr(table, name)
     meta["history"] = {name: list(getattr(table, name)) for name in (*TEXTS, "class_names")}
@@ -309,7 +309,7 @@ def _put_history(slam: OnlineMemory, arrays: dict[str, Any], meta: dict[str, Any
     arrays["history/step_covariance"] = np.array(slam.step_covariances).reshape(-1, 6, 6)
 
 
-def _get_history(slam: OnlineMemory, archive: Npz, meta: dict[str, Any]) -> None:
+def _get_history(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> None:
     if not slam.keyframes.history:
         return
     columns: dict[str, Any] = {name: archive.array(f"history/{name}", finite=False) for name in ARRAYS}

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.data.augment import Augmentation, augment
 from nolbo_ppl.data.loader import Scenes, batch_indices
 from nolbo_ppl.data.mirror import mirror, mirror_voxels
@@ -42,7 +43,7 @@ class SceneSubset:
         return self.scenes.batch(self.index[np.asarray(indices)])
 
 
-class JoinedScenes:
+class ConcatScenes:
     """Several data sets of one pool of shapes, one after the other; smaller images are enlarged to the size of the largest."""
 
     def __init__(self, parts: Sequence[CachedScenes]) -> None:
@@ -122,7 +123,7 @@ class ShapeTable:
         return ShapeBatch(self.packed[index], self.category[index], instance, noise)
 
     @torch.no_grad()
-    def teach(self, model: Nolbo, mirrored: bool = False) -> None:
+    def encode_shapes(self, model: Nolbo, mirrored: bool = False) -> None:
         """Let the trained shape guide encode every shape: the truth of the shape latent in later stages.
 
         Args:
@@ -135,7 +136,7 @@ class ShapeTable:
         self.loc = torch.cat([loc for loc, _ in parts])
         self.scale = torch.cat([scale for _, scale in parts])
 
-    def add_teacher(self, batch: SceneBatch, mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
+    def add_shape_targets(self, batch: SceneBatch, mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
         """The batch with the teacher's posterior of each object; a shape that is not in the table is unknown.
 
         Args:
@@ -161,7 +162,7 @@ class ShapeTable:
         )
 
 
-class SceneSupply:
+class SceneLoader:
     """Shuffled, augmented batches of scenes; step s is a function of (seed, s) alone, whatever came before.
 
     Args:
@@ -228,20 +229,20 @@ class SceneSupply:
 
     def _labelled(self, index: Int[np.ndarray, " b"], mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
         """Scenes of these numbers as they are, or mirrored, with the teacher's latents."""
-        batch = self.table.add_teacher(to_batch(self.scenes.batch(index)), mirrored)
+        batch = self.table.add_shape_targets(to_batch(self.scenes.batch(index)), mirrored)
         if mirrored is not None:
             batch = mirror(batch, mirrored)
         return batch.replace(instance=torch.where(batch.instance < self.known, batch.instance, -1))
 
 
-class MixedSupply:
+class MixedSceneLoader:
     """Batches with a fixed number of scenes from each of several data sets, put together.
 
     Args:
         parts: the supply of each data set; all give images of one size.
     """
 
-    def __init__(self, parts: Sequence[SceneSupply]) -> None:
+    def __init__(self, parts: Sequence[SceneLoader]) -> None:
         self.parts = tuple(parts)
 
     def batch(self, step: int) -> SceneBatch:
@@ -293,3 +294,7 @@ def _filled(value: Tensor, count: int, name: str) -> Tensor:
     """A field with slots added up to a number of them."""
     more = value.new_full((len(value), count - value.shape[1], *value.shape[2:]), _EMPTY.get(name, 0.0))
     return torch.cat((value, more), 1)
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from os import PathLike
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -19,13 +20,13 @@ from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
 from nolbo_ppl.inference.slam.detection_features import fit_prior
-from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE, LoopCloser
+from nolbo_ppl.inference.slam.incremental.incremental_calibration import calibrate_incremental, default_calibration
+from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE_WEIGHT, LoopCloser
+from nolbo_ppl.inference.slam.incremental.incremental_memory import IncrementalMemory
+from nolbo_ppl.inference.slam.incremental.incremental_state import load_state, save_state
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.map_answers import map_landmarks
-from nolbo_ppl.inference.slam.incremental.online_calibration import calibrate_online, default_calibration
-from nolbo_ppl.inference.slam.incremental.online_memory import OnlineMemory
-from nolbo_ppl.inference.slam.incremental.online_state import load_state, save_state
 from nolbo_ppl.inference.slam.incremental.running_map import RunningMap, count_detections, new_landmark
 from nolbo_ppl.inference.slam.initialise import init_from_tracklets
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
@@ -34,7 +35,7 @@ from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamPr
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.tracking import summarise_tracks
-from nolbo_ppl.io.observations import Detections, concatenate
+from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.structures.landmark import Landmark
 
 MOST_WAIT = 5
@@ -42,7 +43,7 @@ MOST_WAIT = 5
 
 
 @dataclass(frozen=True)
-class OnlineInfo:
+class IncrementalInfo:
     """What one keyframe did."""
 
     frame: int
@@ -59,7 +60,7 @@ class OnlineInfo:
     """Poses in the running graph."""
 
 
-class IncrementalSlam(OnlineMemory):
+class IncrementalSlam(IncrementalMemory):
     """Object SLAM fed keyframe by keyframe: `update(odometry, observations)`, then `finish()`.
 
     Scales that the configuration does not state are taken from a reference problem (the first part of a drive, or an
@@ -67,9 +68,9 @@ class IncrementalSlam(OnlineMemory):
 
     Example:
         >>> import nolbo_ppl
-        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
         >>> rng = np.random.default_rng(0)
-        >>> drive = simulate_drive(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
+        >>> drive = simulate_sequence(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
 
         >>> slam = nolbo_ppl.IncrementalSlam()
         >>> for frame, pose in enumerate(drive.odometry[:10]):
@@ -94,7 +95,7 @@ class IncrementalSlam(OnlineMemory):
         odometry: Float[np.ndarray, "4 4"],
         observations: Detections,
         odometry_covariance: Float[np.ndarray, "6 6"] | None = None,
-    ) -> OnlineInfo:
+    ) -> IncrementalInfo:
         """Take the next keyframe.
 
         Args:
@@ -133,7 +134,7 @@ class IncrementalSlam(OnlineMemory):
         self.graph.commit()
         closings = self.loops.close(frame, self.graph, noise, self._live())
         self.T_world_camera = self.graph.pose(frame)
-        return OnlineInfo(frame, self.T_world_camera, len(self.loops.map), closings, met, len(self.graph.of_pose))
+        return IncrementalInfo(frame, self.T_world_camera, len(self.loops.map), closings, met, len(self.graph.of_pose))
 
     def _live(self) -> set[int]:
         """Landmarks that belong to live tracks."""
@@ -144,7 +145,7 @@ class IncrementalSlam(OnlineMemory):
         if self.tracker is not None:
             return
         if self.calibration is not None:
-            self.scales = calibrate_online(self.calibration, self.config)
+            self.scales = calibrate_incremental(self.calibration, self.config)
         else:
             self.scales = default_calibration(first, self.config)
         self.config, self.prior = self.scales.config, self.scales.prior
@@ -282,13 +283,13 @@ class IncrementalSlam(OnlineMemory):
         found, new = self.loops.meet([t.draft for t in tracks], poses, frame, self._live(), self.graph, noise)
         met = 0
         for track, T, (landmark, weight), alone, (_, i) in zip(tracks, poses, found, new, asking):
-            if weight > SURE:
+            if weight > SURE_WEIGHT:
                 old = self.loops.map.landmarks[landmark]
                 track.landmark = landmark
                 old.absorb(track.draft)
                 self.loops.met(landmark, T[:3, 3], noise)
                 met += 1
-            elif alone > SURE or len(track.waiting) >= MOST_WAIT:
+            elif alone > SURE_WEIGHT or len(track.waiting) >= MOST_WAIT:
                 number = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])))
                 track.landmark = track.draft.number = number
                 track.draft.place = self.loops.drift.place
@@ -355,9 +356,9 @@ class IncrementalSlam(OnlineMemory):
 
         Example:
             >>> import pathlib, tempfile
-            >>> from nolbo_ppl.structures.detections import make_table
+            >>> from nolbo_ppl.structures.detections import Detections
             >>> slam = IncrementalSlam()
-            >>> _ = slam.update(np.eye(4), make_table([0], np.array([[0.0, 0.0, 5.0]])))
+            >>> _ = slam.update(np.eye(4), Detections.from_arrays([0], np.array([[0.0, 0.0, 5.0]])))
             >>> file = pathlib.Path(tempfile.mkdtemp()) / "online.npz"
             >>> slam.save(file)
             >>> IncrementalSlam.load(file).frames
@@ -393,7 +394,7 @@ class IncrementalSlam(OnlineMemory):
         if not self.keyframes.history:
             raise input_error("the history was not kept", do="use trajectory() and landmarks(), or KeyframeConfig(history=True)")
         covariance = np.array(self.step_covariances) if self.step_covariances else None
-        problem = SlamProblem(np.array(self.odometry), concatenate(self.tables), covariance)
+        problem = SlamProblem(np.array(self.odometry), Detections.concatenate(self.tables), covariance)
         noise = estimate_noise(problem, self.config)
         prior = fit_prior(problem.observations, self.config, noise)
         tracklets = summarise_tracks(problem, noise, self.config, np.concatenate(self.assigned), np.concatenate(self.weights))
@@ -401,7 +402,7 @@ class IncrementalSlam(OnlineMemory):
         return complete(state)
 
 
-def solve_online(problem: SlamProblem, config: SlamConfig | None = None, calibration_frames: int = 200) -> SlamResult:
+def solve_incremental(problem: SlamProblem, config: SlamConfig | None = None, calibration_frames: int = 200) -> SlamResult:
     """Feed a whole problem keyframe by keyframe; scales nobody stated come from its first frames."""
     first = problem.observations.select(problem.observations.frame < calibration_frames)
     covariance = problem.odometry_covariance
@@ -415,4 +416,5 @@ def solve_online(problem: SlamProblem, config: SlamConfig | None = None, calibra
     return slam.finish()
 
 
-__getattr__ = renamed(__name__, {"ObjectSlam": "IncrementalSlam"})
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

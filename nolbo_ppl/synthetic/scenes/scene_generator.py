@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from nolbo_ppl.synthetic.assets.shape_library import INSTANCES, ShapePool
+from nolbo_ppl._moved import renamed
+from nolbo_ppl.synthetic.assets.shape_library import INSTANCES, ShapeLibrary
 from nolbo_ppl.synthetic.scenes.background_images import Photographs
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, Scene, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
@@ -16,7 +18,7 @@ from nolbo_ppl.synthetic.shapes import Shape
 
 
 @dataclass(frozen=True)
-class SceneSource:
+class SceneGenerator:
     """Scene `index` of a source depends on its fields and on `index` alone.
 
     The seed chooses both the scenes and the shapes: `SEED_STRIDE` keeps the parametric instances of different seeds
@@ -35,9 +37,9 @@ class SceneSource:
     """CAD shapes in place of the parametric ones, or none."""
 
     @cached_property
-    def pool(self) -> ShapePool:
+    def pool(self) -> ShapeLibrary:
         """The shapes; made once in each process."""
-        return ShapePool(self.config.categories, seed=self.seed, instances=self.instances, cad=self.cad)
+        return ShapeLibrary(self.config.categories, seed=self.seed, instances=self.instances, cad=self.cad)
 
     @cached_property
     def photographs(self) -> Photographs | None:
@@ -67,3 +69,7 @@ class SceneSource:
             "shapes": self.pool.describe(),
             "pictures": list(pictures),
         }
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -16,7 +16,7 @@ DEFAULT_RATE = 1e-3
 
 
 @dataclass(frozen=True)
-class OnlineCalibration:
+class IncrementalCalibration:
     """What stays fixed while driving."""
 
     config: SlamConfig
@@ -31,14 +31,14 @@ class OnlineCalibration:
     """The same for orientations."""
 
 
-def default_calibration(first: SlamProblem, config: SlamConfig) -> OnlineCalibration:
+def default_calibration(first: SlamProblem, config: SlamConfig) -> IncrementalCalibration:
     """Without a reference: stated scales and defaults, and the population of the first keyframe."""
     new_rate, clutter_rate = config.new_rate or DEFAULT_RATE, config.clutter_rate or 0.5 * DEFAULT_RATE
     config = replace(config, new_rate=new_rate, clutter_rate=clutter_rate)
-    return OnlineCalibration(config, fit_prior(first.observations, config, estimate_noise(first, config)))
+    return IncrementalCalibration(config, fit_prior(first.observations, config, estimate_noise(first, config)))
 
 
-def calibrate_online(reference: SlamProblem, config: SlamConfig) -> OnlineCalibration:
+def calibrate_incremental(reference: SlamProblem, config: SlamConfig) -> IncrementalCalibration:
     """Scales of a reference problem, for everything the configuration does not state.
 
     A reference of one frame has no steps and gives no scale of the odometry; the defaults stay.
@@ -77,4 +77,4 @@ def calibrate_online(reference: SlamProblem, config: SlamConfig) -> OnlineCalibr
         new_rate=noise.new_rate,
         clutter_rate=noise.clutter_rate,
     )
-    return OnlineCalibration(config, state.prior, noise.position_factor, noise.range_factor, noise.rotation_factor)
+    return IncrementalCalibration(config, state.prior, noise.position_factor, noise.range_factor, noise.rotation_factor)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse, se3_exp
 from nolbo_ppl.inference.slam import IncrementalSlam, SlamConfig, SlamProblem
@@ -20,7 +20,7 @@ CONFIG = SlamConfig(odometry_rotation_scale=0.004, odometry_translation_ratio=0.
 def halfway(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedSequence, IncrementalSlam, Path]:
     rng = np.random.default_rng(2)
     truth = simulate_circuit(rng, laps=2, radius=20.0, frames_per_lap=50)
-    drive = simulate_drive(truth, rng, world=WorldConfig(objects=20, categories=5, latent_dim=4))
+    drive = simulate_sequence(truth, rng, world=WorldConfig(objects=20, categories=5, latent_dim=4))
     table = drive.observations
     slam = IncrementalSlam(CONFIG, SlamProblem(drive.odometry[:50], table.select(table.frame < 50)))
     for t in range(80):

@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.incremental.incremental_calibration import IncrementalCalibration
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
-from nolbo_ppl.inference.slam.incremental.online_calibration import OnlineCalibration
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.inference.slam.tracking import Tracker
 from nolbo_ppl.structures.detections import Detections
 
 
-class OnlineMemory:
-    """What a keyframe reads and leaves behind; what `online_state` writes to a file."""
+class IncrementalMemory:
+    """What a keyframe reads and leaves behind; what `incremental_state` writes to a file."""
 
     config: SlamConfig
     keyframes: KeyframeConfig
-    scales: OnlineCalibration
+    scales: IncrementalCalibration
     prior: FeaturePrior
     loops: LoopCloser
 
