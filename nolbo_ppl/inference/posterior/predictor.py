@@ -16,6 +16,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import boxes_in_image, suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
 from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape, decode_latents, extents, sampled_shapes
+from nolbo_ppl.inference.posterior.folded_networks import FoldedNetworks
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
 from nolbo_ppl.inference.posterior.preprocess import PreprocessedImage, preprocess_all, same_shape
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guessed_intrinsics
@@ -54,6 +55,7 @@ class ObservationModel:
         self.calibration = calibration or Calibration()
         self.config = model.config
         self._prior_mean = model.story.prior.label_mean().detach()
+        self._networks = FoldedNetworks(self.model)
 
     def prior_mean(self) -> Float[np.ndarray, "labels d"]:
         """mu_psi(l) of every category."""
@@ -67,7 +69,7 @@ class ObservationModel:
             raise input_error("shape latents", got=tuple(z.shape), expected=f"(n, {self.config.latent_dim})")
         if len(z) == 0:
             return np.zeros((0,) + (self.config.voxel_size,) * 3, dtype=np.float32)
-        return decode_latents(self.model.story.decoder, z)
+        return decode_latents(self._networks.decoder, z)
 
     @torch.inference_mode()
     def shape_posterior(self, packed: UInt8[np.ndarray, "n bytes"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
@@ -155,7 +157,7 @@ class ObservationModel:
             scaled = [checked[i] * np.tile(prepared[i].scale, 2) for i in group]
             row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
             box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
-            region = self.model.guide.responsible_region(encoding, row, box)
+            region = self._networks.guide.responsible_region(encoding, row, box)
             return row, region, logit[row, region], box
 
         return self._observe(prepared, responsible, decode, samples, seed, batch)
@@ -163,7 +165,7 @@ class ObservationModel:
     @torch.inference_mode()
     def encode(self, image: UInt8[Tensor, "b 3 h w"]) -> Encoding:
         """The network's forward pass over a batch of prepared images."""
-        return self.model.guide.encode(image)
+        return self._networks.guide.encode(image)
 
     @torch.inference_mode()
     def _observe(
@@ -181,8 +183,8 @@ class ObservationModel:
             metres = diagonal.numpy()
             if not decode:
                 return DecodedShape(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
-            story, side = self.model.story, self.config.voxel_size
-            return sampled_shapes(story.decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
+            decoder, side = self._networks.decoder, self.config.voxel_size
+            return sampled_shapes(decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
 
         results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
@@ -206,12 +208,12 @@ class ObservationModel:
     def _parameters(
         self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
     ) -> RegionParameters:
-        q = self.model.guide.parameters_at(encoding, row, region, box=box)
+        q = self._networks.guide.parameters_at(encoding, row, region, box=box)
         return self.calibration.apply(q.at_map_category(self._prior_mean))
 
     def _boxes(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> Float[Tensor, "n 4"]:
         """Boxes of regions, px of the scaled image; no second look is needed for them."""
-        q = self.model.guide.parameters_at(encoding, row, region, look=False)
+        q = self._networks.guide.parameters_at(encoding, row, region, look=False)
         return decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
 
     def _detections(
