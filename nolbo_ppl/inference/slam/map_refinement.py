@@ -182,7 +182,8 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     # Several passes of one object show what one track cannot: how far the detector errs from view to view.
     state = calibrate(state)
     state = merge_duplicates(solve_clean(state, repeats=2, tolerance=1e-5), rng)
-    state = solve_clean(state)
+    # Again: passes that differed by more than the first scales allowed are joined only now.
+    state = solve_clean(calibrate(solve_clean(state, repeats=1)))
     state, _ = reassociate(state, rng)
     state = solve_soft(drop_empty(state, 0.5))
     factors = (1.0, 1.0)

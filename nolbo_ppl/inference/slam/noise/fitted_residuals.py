@@ -45,6 +45,10 @@ class FittedResiduals:
     """Index of each detection into the state's `rows`."""
     oriented: np.ndarray
     """Whether its orientation is informative."""
+    root: Float[np.ndarray, "k 3 3"]
+    """Root of the covariance of its position: times the whitened residual it is the residual, m."""
+    ray: Float[np.ndarray, "k 3"]
+    """Unit vector from the camera to it, in the measured landmark's frame."""
 
 
 def whole_graph(state: SlamState) -> tuple[gtsam.NonlinearFactorGraph, ObservationFactors]:
@@ -72,6 +76,9 @@ def fitted_residuals(state: SlamState, rng: np.random.Generator, count: int = SA
     residual = linearisation.residual[middle:end].reshape(-1, 6)
     oriented = rotation < (0.3 * UNINFORMATIVE_ROTATION_SIGMA) ** 2
     residual[:, :3] *= oriented
+    root = np.linalg.cholesky(factors.covariance[kept][sure, 3:, 3:] / factors.weight[kept][sure, None, None])
+    T = factors.T_camera_landmark[kept][sure]
+    ray = np.einsum("kji,kj->ki", T[:, :3, :3], T[:, :3, 3])
     return FittedResiduals(
         linearisation.residual[6:middle].reshape(-1, 6),
         expected[6:middle].reshape(-1, 6, count),
@@ -79,7 +86,24 @@ def fitted_residuals(state: SlamState, rng: np.random.Generator, count: int = SA
         expected[middle:end].reshape(-1, 6, count)[sure],
         index[sure],
         oriented[sure],
+        root,
+        ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12),
     )
+
+
+def widths_by_ray(found: FittedResiduals) -> tuple[float, float]:
+    """Scale of the bulk of position residuals across the ray and along it, in units of what is expected there."""
+    residual = np.einsum("kij,kj->ki", found.root, found.observation[:, 3:])
+    expected = np.einsum("kij,kjs->kis", found.root, found.observation_expected[:, 3:])
+    along = robust_width(np.sum(found.ray * residual, axis=1), np.einsum("ki,kis->ks", found.ray, expected), least=0.0)
+    # Two directions across: any pair that is orthogonal to the ray.
+    helper = np.where(np.abs(found.ray[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(found.ray, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    pair = np.stack([first, np.cross(found.ray, first)], axis=1)
+    across = np.einsum("kai,ki->ka", pair, residual)
+    across_expected = np.einsum("kai,kis->kas", pair, expected)
+    return robust_width(across.ravel(), across_expected.reshape(across.size, -1), least=0.0), along
 
 
 def squared_ratio(residual: Float[np.ndarray, " k"], expected: Float[np.ndarray, "k s"]) -> tuple[float, float]:
@@ -94,10 +118,10 @@ def squared_ratio(residual: Float[np.ndarray, " k"], expected: Float[np.ndarray,
     return ratio, told
 
 
-def robust_width(residual: Float[np.ndarray, " k"], expected: Float[np.ndarray, "k s"]) -> float:
-    """Scale of the bulk of residuals in units of what is expected; NaN without any."""
+def robust_width(residual: Float[np.ndarray, " k"], expected: Float[np.ndarray, "k s"], least: float = 1e-6) -> float:
+    """Scale of the bulk of residuals in units of what is expected; NaN without any above `least`."""
     mean = np.mean(expected**2, axis=-1)
-    use = mean > 1e-6
+    use = mean > least
     return float(MAD_TO_SCALE * np.median(np.abs(residual[use]) / np.sqrt(mean[use]))) if use.any() else float("nan")
 
 

@@ -11,9 +11,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from nolbo_ppl.inference.slam.noise.fitted_residuals import block_ratio, fitted_residuals, halves_of_tracks, robust_width
+from nolbo_ppl.inference.slam.graph import widened
+from nolbo_ppl.inference.slam.noise.fitted_residuals import (
+    block_ratio,
+    fitted_residuals,
+    halves_of_tracks,
+    robust_width,
+    widths_by_ray,
+)
 from nolbo_ppl.inference.slam.noise.noise_estimation import MIN_RANGE_PART, TOO_SMALL, robust_scale
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
@@ -25,9 +32,13 @@ UNSTATED_FACTOR, UNSTATED_ROTATION_FACTOR = 4.0, 16.0
 """What correlated errors are expected to cost where nobody stated a scale: detectors are biased by view, most of all in
 orientation. A prior: it counts as `PRIOR_BLOCKS` halves of tracks do."""
 PRIOR_BLOCKS = 8.0
-"""Weight of this prior, in halves of tracks."""
+"""Weight of this prior, in halves of tracks of objects seen in one pass: the bias of a pass does not show in it."""
+BETWEEN_PRECISION = 1.2
+"""Precision of what one pass tells of the log of a factor, where several passes of one object show it: a scale of 0.9."""
 POOR_DEPTH = 1.5
 """Depth this many times as noisy as directions is that of a camera: then it is biased as well, and its factor grows."""
+MIN_PASSES = 6
+"""Fewer passes of objects that have several say nothing of what one pass hides."""
 MIN_DETECTIONS = 30
 """Fewer residuals than this calibrate nothing."""
 
@@ -38,6 +49,29 @@ def shrunk_factor(measured: float, blocks: int, expected: float) -> float:
         measured *= max(1 - 2 * np.sqrt(2 / 3 / max(blocks, 1)), 0.0)
     log_factor = (blocks * np.log(max(measured, 1.0)) + PRIOR_BLOCKS * np.log(expected)) / (blocks + PRIOR_BLOCKS)
     return float(np.clip(np.exp(log_factor), 1.0, LARGEST_FACTOR))
+
+
+def between_passes(factor: float, measured: float, blocks: int) -> float:
+    """Factor of unstated scales drawn to what passes of one object show beside each other: the random effect of a view.
+
+    A sum over three components of so many passes is a scaled chi-square; its log has a precision of 1.5 a pass.
+
+    Args:
+        factor: from single passes (`shrunk_factor`).
+        measured: squared ratio of sums over whole passes of objects that have several.
+        blocks: passes it was measured on.
+    """
+    precision = 1.5 * blocks if blocks >= MIN_PASSES else 0.0
+    log_factor = (precision * np.log(max(measured, 1.0)) + BETWEEN_PRECISION * np.log(factor)) / (precision + BETWEEN_PRECISION)
+    return float(np.clip(np.exp(log_factor), 1.0, LARGEST_FACTOR))
+
+
+def rows_of_several_passes(state: SlamState, row: Int[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+    """Which rows of the graph are of landmarks that two tracks or more placed."""
+    track, landmark = state.tracklets.of_observation[state.rows], state.landmark
+    placed = np.unique(np.stack([landmark, track], axis=1)[(state.weight > 0.5) & (track >= 0)], axis=0)
+    passes = np.bincount(placed[:, 0], minlength=int(landmark.max(initial=-1)) + 1)
+    return passes[landmark[row]] >= 2
 
 
 def unstated_range_factor(report: dict[str, float], distance: float) -> float:
@@ -71,7 +105,8 @@ def calibrate(state: SlamState) -> SlamState:
     report, warnings = dict(noise.report), list(noise.warnings)
     found = fitted_residuals(state, np.random.default_rng([config.seed, 15485863]))
     rows = state.rows[found.row]
-    block = halves_of_tracks(state.tracklets.of_observation[rows], state.problem.observations.frame[rows])
+    track = state.tracklets.of_observation[rows]
+    block, several = halves_of_tracks(track, state.problem.observations.frame[rows]), rows_of_several_passes(state, found.row)
     position, expected = found.observation[:, 3:], found.observation_expected[:, 3:]
     if len(rows) >= MIN_DETECTIONS:
         # The graph's covariances hold the factors in use; what is measured is relative to them.
@@ -79,16 +114,27 @@ def calibrate(state: SlamState) -> SlamState:
         ratio = _width(position, expected) * np.sqrt(used)
         report["position_track_width"] = ratio
         change = _change(ratio, "position", stated[rows], config.correct_scales, warnings)
-        covariance = noise.position_covariance * np.where(stated, change[0], change[1])[:, None, None] ** 2
+        # Where nobody stated them, directions and depth are told apart: gaps between frames hold the odometry's steps as well.
+        across, along_ray = (np.sqrt(width**2 * used) if np.isfinite(width) else change[1] for width in widths_by_ray(found))
+        free = widened(
+            noise.position_covariance,
+            state.problem.observations.position,
+            *(max(float(width), MIN_FACTOR) ** 2 for width in (across, along_ray)),
+        )
+        covariance = np.where(stated[:, None, None], noise.position_covariance * change[0] ** 2, free)
         floor = (MIN_RANGE_PART * state.typical_range) ** 2 * np.eye(3)
         covariance = np.where(stated[:, None, None], covariance, covariance + floor)
         measured, blocks = block_ratio(position, expected, block)
         # Widths of single residuals are given to the scale; what is left of the sums is correlation.
-        report["position_correlation_factor"] = measured = measured * used
+        report["position_correlation_factor"] = measured
         if stated[rows].mean() > 0.5:
             factor = along_factor = shrunk_factor(measured, blocks, 1.0)
         else:
-            factor, along_factor = (shrunk_factor(measured, blocks, prior) for prior in (UNSTATED_FACTOR, along))
+            between = block_ratio(position[several], expected[several], track[several])
+            factor, along_factor = (
+                between_passes(shrunk_factor(measured, blocks, prior), between[0], between[1])
+                for prior in (UNSTATED_FACTOR, along)
+            )
         noise = replace(noise, position_covariance=covariance, position_factor=factor, range_factor=along_factor)
     whole = found.oriented.any(axis=1)
     if whole.sum() >= MIN_DETECTIONS:
@@ -104,9 +150,16 @@ def calibrate(state: SlamState) -> SlamState:
             report["rotation_track_width"] = ratio
             scale = np.maximum(noise.rotation_scale * np.where(rotation_stated, change[0], change[1]), 1e-4)
             measured, blocks = block_ratio(turn * axes, turn_expected * axes[:, :, None], block[whole])
-            report["rotation_correlation_factor"] = measured = measured * used
-            prior = 1.0 if rotation_stated[rows[whole]].mean() > 0.5 else UNSTATED_ROTATION_FACTOR
-            noise = replace(noise, rotation_scale=scale, rotation_factor=shrunk_factor(measured, blocks, prior))
+            report["rotation_correlation_factor"] = measured
+            if rotation_stated[rows[whole]].mean() > 0.5:
+                factor = shrunk_factor(measured, blocks, 1.0)
+            else:
+                several = several[whole]
+                shown, passes = block_ratio(
+                    (turn * axes)[several], (turn_expected * axes[:, :, None])[several], track[whole][several]
+                )
+                factor = between_passes(shrunk_factor(measured, blocks, UNSTATED_ROTATION_FACTOR), shown, passes)
+            noise = replace(noise, rotation_scale=scale, rotation_factor=factor)
     ratio = latent_width(state)
     if np.isfinite(ratio):
         latent_stated = np.isfinite(state.problem.observations.latent_scale).all(axis=1) | (config.latent_scale is not None)
