@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_drive
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.inference.slam.noise.residual_calibration import (
@@ -26,7 +26,7 @@ def solved(bias: float) -> SlamState:
     """Two laps past 30 objects, no scale of a detection stated; `bias`: scale of each object's own error in a lap, m."""
     rng = np.random.default_rng(11)
     truth = simulate_circuit(rng, laps=2, radius=15.0, frames_per_lap=FRAMES_PER_LAP)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=30, categories=10, latent_dim=4),
@@ -83,7 +83,7 @@ def test_depth_and_directions_have_scales_of_their_own() -> None:
     """A camera's detections: 0.05 m across the ray, 0.25 m along it, nothing stated."""
     rng = np.random.default_rng(5)
     truth = simulate_circuit(rng, laps=1, radius=15.0, frames_per_lap=60)
-    drive = simulate_drive(
+    drive = simulate_sequence(
         truth,
         rng,
         world=WorldConfig(objects=30, categories=10, latent_dim=0),
