@@ -8,8 +8,10 @@ STAMP := $(VENV)/.installed
 TEST_WORKERS ?= 2
 # Time of `make fuzz`; hours find more.
 FUZZ_SECONDS ?= 600
+# Kills, signals and full disks of `make faults`.
+FAULTS ?= 100
 
-.PHONY: setup demo train test test-shapes lint wheel bench bench-gate docs clean fuzz
+.PHONY: setup demo train test test-shapes lint wheel bench bench-gate docs clean fuzz faults
 
 setup: $(STAMP)
 
@@ -56,6 +58,9 @@ bench-gate: $(STAMP)
 
 fuzz: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py --seconds $(FUZZ_SECONDS) --out build/fuzz.json
+
+faults: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/faults.py --count $(FAULTS) --out build/faults.json
 
 docs: $(STAMP)
 	OMP_NUM_THREADS=1 NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

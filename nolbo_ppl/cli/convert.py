@@ -249,7 +249,8 @@ def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
     source: Any = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
     names = SCENES if hasattr(source, "write") and not isinstance(source, ForeignFile) else DRIVE
-    with output_folder(source.out, names, is_own=is_converted) as folder:
+    inputs = [getattr(source, name, None) for name in ("data", "images", "intrinsics", "names", "heights")]
+    with output_folder(source.out, names, is_own=is_converted, inputs=inputs) as folder:
         if hasattr(source, "write"):
             written = dataclasses.replace(source, out=folder).write()
         else:

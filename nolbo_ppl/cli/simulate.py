@@ -28,8 +28,13 @@ from nolbo_ppl.data.simulate import (
 from nolbo_ppl.data.simulated_paths import circle, figure_of_eight, room, straight
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose
+from nolbo_ppl.io.files import read_json_object
 from nolbo_ppl.io.observations import Detections
+from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
+
+RESULT = ("odometry.txt", "truth.txt", "observations.jsonl", "objects.json", "source.json")
+"""Files of a simulated drive."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +181,7 @@ def run(config: SimulateConfig) -> SimulatedSequence:
     """Simulate and write the folder.
 
     Raises:
-        InputError: an option out of its range, or a trajectory that cannot be read.
+        InputError: an option out of its range, a trajectory that cannot be read, or a folder that holds something else.
     """
     drive = simulate(config)
     assert drive.world is not None
@@ -190,8 +195,15 @@ def run(config: SimulateConfig) -> SimulatedSequence:
         T_world_object={f"o{k}": pose for k, pose in enumerate(poses)},
         source={"simulated": {**asdict(config), "out": None, "trajectory": str(config.trajectory or "") or None}},
     )
-    write_converted(config.out, data)
+    with output_folder(config.out, RESULT, is_own=is_simulated, inputs=(config.trajectory,)) as folder:
+        write_converted(folder, data)
     return drive
+
+
+def is_simulated(folder: Path) -> bool:
+    """Whether a folder holds a simulated drive that another may replace."""
+    file = folder / "source.json"
+    return file.is_file() and "simulated" in read_json_object(file)
 
 
 def main(args: Sequence[str] | None = None) -> None:

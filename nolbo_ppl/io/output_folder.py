@@ -184,8 +184,14 @@ def output_folder(
         try:
             yield new
             write_json(new / OWN, sorted(own))
-            os.replace(new, out / COMPLETE)
-            finish(out)
+            try:
+                os.replace(new, out / COMPLETE)
+                finish(out)
+            except Exception:
+                raise
+            except BaseException:  # Ctrl-C among the moves, which take milliseconds: they come to their end
+                finish(out)
+                raise
         finally:
             shutil.rmtree(new, ignore_errors=True)
 
