@@ -11,7 +11,7 @@ import numpy as np
 
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence
 from nolbo_ppl.data.sequences.opening import open_frames
-from nolbo_ppl.data.sequences.undistorted import guessed_camera, without_distortion
+from nolbo_ppl.data.sequences.undistorted import guessed_camera, recorded_camera, without_distortion
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
@@ -27,10 +27,12 @@ class ObserveConfig:
     """What to observe and where to write."""
 
     images: Path
-    """Folder of images or a video; a detection's `frame` is the index of its image in natural order of the names (frame2
-    before frame10), the same as in `nolbo odometry` and `nolbo run`."""
+    """Folder of images, a video or a bag of ROS; a detection's `frame` is the index of its image in natural order of the names
+    (frame2 before frame10), the same as in `nolbo odometry` and `nolbo run`."""
     out: Path
     """Folder for observations.jsonl and the pictures."""
+    topic: str | None = None
+    """Topic of the images of a bag; by default its only one. Its camera info gives the camera."""
     model: str = "photo"
     """Name of weights in the package (`photo` for photographs, `tiny` for generated scenes), or a folder with a model of your
     own."""
@@ -71,7 +73,11 @@ def run(config: ObserveConfig) -> ObserveSummary:
     Raises:
         InputError: no images, no such model, or an output folder that holds something else.
     """
-    frames, model = open_frames(config.images), load(config.model)
+    frames, model = open_frames(config.images, config.topic), load(config.model)
+    recorded = recorded_camera(frames) if config.camera is None and config.intrinsics is None else None
+    if recorded is not None:
+        frames, camera = without_distortion(frames, recorded[0])
+        config = replace(config, intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy))
     if config.camera is not None:
         if config.intrinsics is not None:
             raise input_error("--camera and --intrinsics", got="both", expected="one of the two")

@@ -14,16 +14,12 @@ import numpy as np
 from nolbo_ppl._version import __version__
 from nolbo_ppl.data.sequences import (
     FrameSequence,
-    ImageFolder,
-    guessed_camera,
+    frames_with_camera,
     open_frames,
-    read_camera,
     read_lengths,
-    without_distortion,
 )
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json_object, write_json
-from nolbo_ppl.io.images import exif_focal_length
 from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, read_frame_poses, write_trajectory
@@ -45,9 +41,11 @@ class OdometryRunConfig:
     """Simple visual odometry: motion from matched features, its length from elsewhere, a covariance for every step."""
 
     images: Path
-    """Folder of images (KITTI, TUM RGB-D, any names) or a video."""
+    """Folder of images (KITTI, TUM RGB-D, any names), a video or a bag of ROS (`BAG:/topic`)."""
     out: Path
     """Folder for odometry.txt, odometry_covariance.npz and odometry.json."""
+    topic: str | None = None
+    """Topic of the images of a bag; by default its only one."""
     intrinsics: Path | None = None
     """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, intrinsics.json, a KITTI calib.txt, or a text file with fx fy cx cy
     and the distortion, which is taken out of the images. Without a file the camera is guessed."""
@@ -196,13 +194,8 @@ def run(arguments: OdometryRunConfig) -> tuple[Odometry, dict[str, Any]]:
 
 
 def _estimate(arguments: OdometryRunConfig, folder: Path) -> tuple[Odometry, dict[str, Any]]:
-    frames, remarks = open_frames(arguments.images), list[str]()
-    if arguments.intrinsics is None:
-        first = frames.files[0] if isinstance(frames, ImageFolder) else None
-        camera, remark = guessed_camera(frames.size, None if first is None else exif_focal_length(first))
-        remarks.append(remark)
-    else:
-        frames, camera = without_distortion(frames, read_camera(arguments.intrinsics, frames.size))
+    frames, camera, remark = frames_with_camera(open_frames(arguments.images, arguments.topic), arguments.intrinsics)
+    remarks = [remark] if remark else []
     part, intrinsics = part_of(frames, arguments.first, arguments.count), camera.vector
     truth = None if arguments.truth is None else true_poses(arguments.truth, part)
     scale = scale_of(arguments, part, truth)

@@ -16,6 +16,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.distortion import COUNTS, DistortionModel, zoom_without_rims
 from nolbo_ppl.io.camera_documents import FORMATS, distortion_of, fields_of, load_yaml, unknown_fields
 from nolbo_ppl.io.files import read_json, write_json
+from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.text import read_lines, read_words
 
 NAMES = ("fx", "fy", "cx", "cy")
@@ -230,7 +231,8 @@ def read_intrinsics(path: str | PathLike[str], size: tuple[int, int] | None = No
 
 def read_camera(path: str | PathLike[str], size: tuple[int, int] | None = None) -> CameraIntrinsics:
     """Read a camera: YAML of OpenCV, ROS (`camera_info`), Kalibr, EuRoC, ORB-SLAM, OpenVSLAM or VINS; JSON with fx, fy, cx, cy
-    (and width, height, distortion); a KITTI calibration (P2, else P0); or numbers, fx fy cx cy and the distortion.
+    (and width, height, distortion); a KITTI calibration (P2, else P0); numbers, fx fy cx cy and the distortion; or a bag of ROS,
+    `BAG` or `BAG:/camera_info` (extra `ros`).
 
     A distortion that is given is kept (`is_distorted`), one of zeros is none. Unknown fields of JSON are refused.
 
@@ -245,12 +247,33 @@ def read_camera(path: str | PathLike[str], size: tuple[int, int] | None = None) 
         InputError: a malformed file, or intrinsics that cannot be those of such images; names file and line.
     """
     path = Path(path)
+    if is_bag(path):
+        from nolbo_ppl.io.ros_messages import read_camera_info  # only a bag needs it
+
+        found = read_camera_info(path)
+        assert found is not None  # None is for images that have no camera info beside them
+        return checked(_from_fields(fields_of(found[0], path), path), size, path, None)
     if path.suffix.lower() == ".json":
         return checked(_from_json(path), size, path, None)
     if path.suffix.lower() in (".yaml", ".yml"):
         return checked(_from_fields(fields_of(load_yaml(path, read_lines(path)), path), path), size, path, None)
     values, line = _from_text(path)
     return checked(values, size, path, line)
+
+
+def camera_of_images(path: str | PathLike[str], topic: str, size: tuple[int, int]) -> tuple[CameraIntrinsics, str] | None:
+    """The camera whose info lies beside a topic of images in a bag, and its topic; None where there is none.
+
+    Raises:
+        InputError: a camera without a calibration, or one of images of another size.
+    """
+    from nolbo_ppl.io.ros_messages import read_camera_info
+
+    found = read_camera_info(path, topic)
+    if found is None:
+        return None
+    file = Path(path)
+    return checked(_from_fields(fields_of(found[0], file), file), size, file, None), found[1]
 
 
 def write_camera(path: str | PathLike[str], values: CameraIntrinsics) -> None:

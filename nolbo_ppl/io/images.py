@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from os import PathLike
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -30,6 +31,13 @@ UNREADABLE = {".heic": "convert HEIC to JPEG or PNG first", ".heif": "convert HE
 """Endings of pictures that are not read, and what to do about them."""
 
 Source = tuple[str | PathLike[str], int | None]
+File = str | PathLike[str] | BinaryIO
+"""A file, or the bytes of one."""
+
+
+def _label(file: File, label: str | None) -> str | PathLike[str]:
+    """What a picture is called in messages."""
+    return label or ("a picture in memory" if not isinstance(file, str | PathLike) else file)
 
 
 def natural(path: Path) -> tuple[tuple[tuple[int, int, str], ...], str]:
@@ -94,10 +102,11 @@ def _failure(what: str, path: str | PathLike[str], got: object, named_by: Source
     return input_error(f"image {Path(path).name}: {what}", got=got, file=named_by[0], line=named_by[1], do=do)
 
 
-def _opened(path: str | PathLike[str], named_by: Source | None, what: str = "not a readable image") -> Image.Image:
+def _opened(file: File, named_by: Source | None, what: str = "not a readable image", label: str | None = None) -> Image.Image:
     """The header of an image, nothing decoded. Raises `InputError` when it is none, or too large."""
+    path = _label(file, label)
     try:
-        image = Image.open(path, formats=DECODERS)
+        image = Image.open(file, formats=DECODERS)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise _failure("image too large", path, error, named_by, f"at most {MAXIMUM_PIXELS} pixels are read") from None
     except OSError as error:
@@ -151,7 +160,7 @@ def _rgb(image: Image.Image, kind: str | None) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def open_image(
-    path: str | PathLike[str], *, named_by: Source | None = None, shorter_side: int | None = None
+    path: File, *, named_by: Source | None = None, shorter_side: int | None = None, label: str | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Decode an image to upright RGB of eight bits.
 
@@ -159,7 +168,8 @@ def open_image(
     orientation of a camera is applied. Of files with several pictures the first is read.
 
     Args:
-        path: the file; its content decides how it is decoded, among PNG, JPEG, BMP, WebP, PPM/PGM and TIFF.
+        path: the file, or its bytes; its content decides how it is decoded, among PNG, JPEG, BMP, WebP, PPM/PGM and TIFF.
+        label: what bytes are called in messages.
         named_by: file and line of the list that named the image, for messages.
         shorter_side: JPEG files may be decoded smaller (by 2, 4 or 8), but with a shorter side of at least this many px.
 
@@ -176,13 +186,13 @@ def open_image(
         >>> open_image(file)[0, 0].tolist(), open_image(file).shape
         ([123, 123, 123], (2, 3, 3))
     """
-    with _opened(path, named_by) as image:
+    with _opened(path, named_by, label=label) as image:
         try:
             if shorter_side is not None:
                 image.draft("RGB", (shorter_side, shorter_side))
             return np.array(_rgb(_upright(image), image.format))
         except Exception as error:  # decoders raise whatever damaged data make them run into
-            raise _failure("not a readable image", path, error, named_by) from None
+            raise _failure("not a readable image", _label(path, label), error, named_by) from None
 
 
 def image_size(path: str | PathLike[str], *, named_by: Source | None = None) -> tuple[int, int]:
@@ -208,18 +218,18 @@ def exif_focal_length(path: str | PathLike[str]) -> float | None:
         return equivalent / 36 * max(image.size) if 5 <= equivalent <= 1000 else None
 
 
-def open_depth_image(path: str | PathLike[str], *, named_by: Source | None = None) -> Int[np.ndarray, "h w"]:
+def open_depth_image(path: File, *, named_by: Source | None = None, label: str | None = None) -> Int[np.ndarray, "h w"]:
     """Values of an image of one channel of 16 or 32 bits, unscaled, as int64.
 
     Raises:
         InputError: not a readable image, or one of several channels or of 8 bits; names the file.
     """
-    with _opened(path, named_by, "not a readable depth image") as image:
+    with _opened(path, named_by, "not a readable depth image", label) as image:
         try:
             values = np.asarray(image)
         except Exception as error:  # decoders raise whatever damaged data make them run into
-            raise _failure("not a readable depth image", path, error, named_by) from None
+            raise _failure("not a readable depth image", _label(path, label), error, named_by) from None
     if values.ndim != 2 or values.dtype not in (np.dtype(np.uint16), np.dtype(np.int32)):
         got = f"{values.dtype} {values.shape}, expected one channel of 16 bits"
-        raise _failure("not a depth image", path, got, named_by)
+        raise _failure("not a depth image", _label(path, label), got, named_by)
     return values.astype(np.int64)

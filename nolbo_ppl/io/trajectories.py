@@ -16,6 +16,7 @@ from nolbo_ppl.geometry.pose import matrix_to_quaternion, relative, se3_exp, se3
 from nolbo_ppl.io.files import atomic_path
 from nolbo_ppl.io.images import natural
 from nolbo_ppl.io.npz import read_npz
+from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.text import read_lines
 from nolbo_ppl.io.trajectory_tables import TableFormat, parse_table
 
@@ -63,7 +64,8 @@ def read_trajectory(
     times in ns (see `nolbo_ppl.io.trajectory_tables`).
 
     Args:
-        path: the file, or the folder of one 4 x 4 matrix a file (ScanNet's `pose/`).
+        path: the file; the folder of one 4 x 4 matrix a file (ScanNet's `pose/`); or a bag of ROS, `BAG` or `BAG:/topic`
+            (Odometry, PoseStamped, TransformStamped; extra `ros`).
         form: the format, where it is not to be told from the file.
         lost: rows of nothing but nan or inf are poses that are not known (NaN), as a truth may have.
         repeated: equal times in a row are harmless: the first is kept, the others are counted.
@@ -85,6 +87,8 @@ def read_trajectory(
         array([0. , 0. , 0.5])
     """
     path = Path(path)
+    if is_bag(path):
+        return _poses_of_bag(path, lost)
     if path.is_dir():
         return _folder_of_poses(path, lost)
     found = parse_table(path, read_lines(path), form, lost=lost)
@@ -98,6 +102,16 @@ def read_trajectory(
         raise input_error("time does not increase", got=got, file=path, line=int(found.lines[row]))
     keep = np.concatenate([[True], step > 0])
     return Trajectory(found.T_world_camera[keep], found.times[keep], "tum", repeated_stamps=int((~keep).sum()))
+
+
+def _poses_of_bag(path: Path, lost: bool) -> Trajectory:
+    from nolbo_ppl.io.ros_messages import read_bag_poses  # only a bag needs it
+
+    T, times, repeated = read_bag_poses(path)
+    known = np.isfinite(T).all(axis=(1, 2))
+    if not lost and not known.all():
+        raise input_error("a pose is not finite, or no rotation", got=f"message {int(np.argmin(known))}", file=path)
+    return Trajectory(T, times, "tum", repeated_stamps=repeated)
 
 
 def _folder_of_poses(folder: Path, lost: bool) -> Trajectory:
@@ -281,6 +295,7 @@ def poses_of_frames(
     *,
     form: TableFormat | None = None,
     tolerance: float = TIME_TOLERANCE,
+    interpolate: bool = False,
     what: str = "truth",
     of: str = "the frames",
 ) -> Float[np.ndarray, "n 4 4"]:
@@ -289,7 +304,9 @@ def poses_of_frames(
     Raises:
         InputError: as there, or a frame without a pose; names the file.
     """
-    found = read_frame_poses(path, frames, times, part, form=form, tolerance=tolerance, lost=False, what=what, of=of)
+    found = read_frame_poses(
+        path, frames, times, part, form=form, tolerance=tolerance, interpolate=interpolate, lost=False, what=what, of=of
+    )
     if not found.known.all():
         raise input_error(
             f"{what} lacks times of {of}",

@@ -21,6 +21,8 @@ from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_incremental
 from nolbo_ppl.inference.slam.map_files import library_versions, write_result
 from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.ros_bags import is_bag
+from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.io.trajectories import Trajectory
 from nolbo_ppl.pipeline.depth_refinement import DepthScale
@@ -106,7 +108,7 @@ class ObjectMappingPipeline:
     def depth_source(self) -> DepthSource:
         """Depth of the keyframes, where there is any."""
         config, index = self.config, self.run.keyframes.tolist()
-        if config.depth is not None:
+        if config.depth is not None and not is_bag(config.depth):
             return DepthImages(beside(config.depth, self.run.image_names, index), DepthScale(config.depth_unit))
         if config.right is not None and config.baseline is not None:
             right = open_frames(config.right)
@@ -145,6 +147,10 @@ class ObjectMappingPipeline:
         run = self.run
         shapes = {name: voxels[0] for name in run.voxel_names if (voxels := run.voxels(name)) is not None}
         write_glb(run.mesh, build_scene(run.landmarks, shapes, run.estimate))
+        if self.config.mcap:
+            times = [row.get("time") for row in run.frames]
+            known = np.array(times, dtype=np.float64) if times and None not in times else None
+            write_map_mcap(self.out / MCAP, Trajectory(run.estimate, known), run.landmarks, run.odometry)
 
     def crops(self) -> None:
         """The best picture of each landmark."""
@@ -186,7 +192,7 @@ class ObjectMappingPipeline:
             ),
             "observe": (("observations.jsonl",), self.observe),
             "slam": (("slam",), self.slam),
-            "map": (("map.glb",), self.map),
+            "map": (("map.glb", f"{MCAP}?"), self.map),
             "crops": (("crops",), self.crops),
             "figures": (("summary.json", "objects.json?"), self.figures),
             "report": (("report.html",), self.report),

@@ -23,9 +23,12 @@ class RunConfig:
     """
 
     images: Path = field(metadata=affects("odometry", "images"))
-    """Folder of images (plain, KITTI or TUM), or a video file."""
+    """Folder of images (plain, KITTI or TUM), a video file, or a bag of ROS (extra `ros`): of it, odometry, truth, intrinsics
+    and depth are named by `BAG:/topic`."""
     out: Path = field(metadata=affects(None))
     """Folder of the run. Stages that are complete in it are not done again."""
+    topic: str | None = field(default=None, metadata=affects("odometry"))
+    """Topic of the images of a bag; by default its only one. Its camera info gives the camera."""
     intrinsics: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, JSON with fx, fy, cx, cy in px of the images, a KITTI calib.txt, or
     numbers. Its distortion is taken out of the images. Without a file the camera is guessed, which makes ranges wrong."""
@@ -62,13 +65,15 @@ class RunConfig:
     batch: int = field(default=16, metadata=affects(None))
     """Images that go through the network at once."""
     depth: Path | None = field(default=None, metadata=affects("observe", "folder"))
-    """Folder of depth pictures (16 bit PNG, same names or same order as the images): refine positions."""
+    """Folder of depth pictures (16 bit PNG, same names or same order as the images), or `BAG:/topic`: refine positions."""
     depth_unit: float = field(default=1 / 5000, metadata=affects("observe"))
     """Metres of one step of them: TUM 1/5000, YCB-Video 1/10000, millimetres 1/1000."""
     right: Path | None = field(default=None, metadata=affects("observe", "folder"))
     """Folder of the right images of a rectified stereo pair: refine positions."""
     baseline: float | None = field(default=None, metadata=affects("observe"))
     """Distance of the two cameras, m."""
+    mcap: bool = field(default=False, metadata=affects("map"))
+    """Also write trajectory and map as map.mcap, for Foxglove and rviz (extra `ros`)."""
     report: bool = field(default=True, metadata=affects(None))
     """Write report.html."""
     loop_gap: int = field(default=50, metadata=affects("figures"))

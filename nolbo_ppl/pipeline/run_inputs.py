@@ -11,18 +11,17 @@ from jaxtyping import Float, Int, UInt8
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.data.sequences import (
+    BagFrames,
     CameraIntrinsics,
     FrameSequence,
     ImageFolder,
     UndistortedFrames,
-    guessed_camera,
+    frames_with_camera,
     open_frames,
-    read_camera,
     read_lengths,
-    without_distortion,
 )
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.images import exif_focal_length
+from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.trajectories import covariance_beside, poses_of_frames, read_frame_poses
 from nolbo_ppl.odometry import (
     GroundHeight,
@@ -74,6 +73,8 @@ class RunInputs:
         source = self._source
         if isinstance(source, ImageFolder):
             return [[file.name, file.stat().st_size] for file in source.files]
+        if isinstance(source, BagFrames):
+            return [len(source), source.topic, source.path.name, source.path.stat().st_size]
         return [len(source), source.path.stat().st_size]
 
 
@@ -115,19 +116,15 @@ def open_run_inputs(config: RunConfig) -> RunInputs:
     Raises:
         InputError: one of them is missing or malformed, or they do not fit each other.
     """
-    frames = open_frames(config.images)
-    remarks: list[str] = []
-    if config.intrinsics is None:
-        first = frames.files[0] if isinstance(frames, ImageFolder) else None
-        camera, remark = guessed_camera(frames.size, None if first is None else exif_focal_length(first))
-        remarks.append(remark)
-    else:
-        frames, camera = without_distortion(frames, read_camera(config.intrinsics, frames.size))
-        if isinstance(frames, UndistortedFrames) and (config.depth is not None or config.right is not None):
-            raise input_error("--depth or --right with a distorted camera", expected="images that were rectified together")
+    depth = config.depth if config.depth is not None and is_bag(config.depth) else None
+    frames = open_frames(config.images, config.topic, depth)
+    frames, camera, remark = frames_with_camera(frames, config.intrinsics)
+    remarks = [remark] if remark else []
+    if isinstance(frames, UndistortedFrames) and (config.depth is not None or config.right is not None):
+        raise input_error("--depth or --right with a distorted camera", expected="images that were rectified together")
     truth = None
     if config.truth is not None:
-        found = read_frame_poses(config.truth, len(frames), frames.times, of="the images")
+        found = read_frame_poses(config.truth, len(frames), frames.times, interpolate=is_bag(config.truth), of="the images")
         truth = found.T_world_camera
         remarks += found.remarks()
     return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth, tuple(remarks))
@@ -180,7 +177,9 @@ def estimate_or_read(drive: RunInputs, config: RunConfig) -> FoundOdometry:
         )
         return FoundOdometry(found, stated=True)
     frames = drive.frames
-    poses = poses_of_frames(config.odometry, len(frames), frames.times, what="odometry", of="the images")
+    poses = poses_of_frames(
+        config.odometry, len(frames), frames.times, interpolate=is_bag(config.odometry), what="odometry", of="the images"
+    )
     covariance = covariance_beside(config.odometry)
     stated = covariance is not None and len(covariance) == len(poses) - 1
     n = len(poses) - 1

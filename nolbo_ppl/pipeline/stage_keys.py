@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.ros_bags import is_bag, split_topic
 
 StageName = Literal["odometry", "observe", "slam", "map", "crops", "figures", "report"]
 STAGES: tuple[StageName, ...] = ("odometry", "observe", "slam", "map", "crops", "figures", "report")
@@ -69,14 +70,17 @@ def json_of(config: Any) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config), default=plain))
 
 
-def file_digest(path: Path | None) -> str | None:
-    """Digest of a file's content, None without a file.
+def file_digest(path: Path | None) -> Any:
+    """Digest of a file's content, None without a file; of a bag, which may be larger than memory, name and size.
 
     Raises:
         InputError: there is no such file.
     """
     if path is None:
         return None
+    if is_bag(path):
+        file = split_topic(path)[0]
+        return [str(path), file.stat().st_size if file.exists() else None]
     if not path.is_file():
         raise input_error("no such file", file=path)
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

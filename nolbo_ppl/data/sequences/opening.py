@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.data.sequences.bag_frames import BagFrames
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder, list_frames
 from nolbo_ppl.data.sequences.video import VIDEO_SUFFIXES, VideoFile
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.text import read_times
 
 IMAGE_FOLDERS = ("image_2", "image_0", "image_02", "images", "rgb", "data")
@@ -39,19 +41,29 @@ def find_times(folder: Path, top: Path, count: int) -> Float[np.ndarray, " n"] |
     return None
 
 
-def open_frames(path: str | PathLike[str]) -> FrameSequence:
-    """Open a sequence: a TUM RGB-D folder (`rgb.txt`), a folder of images or one that holds `image_2` or the like, a video.
+def open_frames(path: str | PathLike[str], topic: str | None = None, depth: str | PathLike[str] | None = None) -> FrameSequence:
+    """Open a sequence: a TUM RGB-D folder (`rgb.txt`), a folder of images or one that holds `image_2` or the like, a video, or
+    a topic of a ROS bag (extra `ros`).
+
+    Args:
+        path: the folder or file; of a bag also `BAG:/topic`.
+        topic: topic of a bag; the only one with images by default.
+        depth: `BAG:/topic` of the depth images that belong to those of a bag.
 
     Raises:
         InputError: nothing there, no image, lists or times that are malformed (names file and line).
     """
     path = Path(path)
+    if is_bag(path):
+        return BagFrames(path, topic, depth)
+    if topic is not None:
+        raise input_error("--topic", got=topic, expected="a bag of ROS as --images", file=path)
     if path.is_file():
         if path.suffix.lower() not in VIDEO_SUFFIXES:
             raise input_error(
                 "not a sequence of frames",
                 got=path.name,
-                expected="a folder, or a video (" + ", ".join(VIDEO_SUFFIXES) + ")",
+                expected="a folder, a video (" + ", ".join(VIDEO_SUFFIXES) + ") or a bag of ROS (.bag, .mcap, .db3)",
                 file=path,
             )
         return VideoFile(path)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nolbo_ppl.data.sequences.image_sequence import FrameSequence
+from nolbo_ppl.data.sequences.bag_frames import BagFrames
+from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.distortion import undistort_image
-from nolbo_ppl.io.camera_files import CameraIntrinsics
+from nolbo_ppl.io.camera_files import CameraIntrinsics, camera_of_images, read_camera
+from nolbo_ppl.io.images import exif_focal_length
 
 
 class UndistortedFrames(FrameSequence):
@@ -81,3 +84,31 @@ def guessed_camera(size: tuple[int, int], focal: float | None = None) -> tuple[C
         "nothing of it: calibrate the camera"
     )
     return CameraIntrinsics(float(focal), float(focal), width / 2, height / 2, width, height), remark
+
+
+def recorded_camera(frames: FrameSequence) -> tuple[CameraIntrinsics, str] | None:
+    """The camera that a bag recorded with its images, and a remark that says so; None where there is none.
+
+    Raises:
+        InputError: a camera info without a calibration, or one of images of another size.
+    """
+    found = camera_of_images(frames.path, frames.topic, frames.size) if isinstance(frames, BagFrames) else None
+    return None if found is None else (found[0], f"the camera is that of {found[1]}")
+
+
+def frames_with_camera(frames: FrameSequence, file: Path | None) -> tuple[FrameSequence, CameraIntrinsics, str]:
+    """Frames without distortion, their pinhole camera, and what has to be said of it ("" where it was given).
+
+    The camera is that of the file, else the one a bag recorded, else a guess, by the EXIF focal length where there is one.
+
+    Raises:
+        InputError: a camera that cannot be read, or does not belong to these images.
+    """
+    if file is not None:
+        return *without_distortion(frames, read_camera(file, frames.size)), ""
+    recorded = recorded_camera(frames)
+    if recorded is not None:
+        return *without_distortion(frames, recorded[0]), recorded[1]
+    first = frames.files[0] if isinstance(frames, ImageFolder) else None
+    camera, remark = guessed_camera(frames.size, None if first is None else exif_focal_length(first))
+    return frames, camera, remark
