@@ -14,7 +14,8 @@ from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import RESULT, is_result, write_result
 from nolbo_ppl.io.observations import read_observations
 from nolbo_ppl.io.output_folder import output_folder
-from nolbo_ppl.io.trajectories import TIME_TOLERANCE, read_covariance, read_frame_poses, read_trajectory
+from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
+from nolbo_ppl.io.trajectories import TIME_TOLERANCE, Trajectory, read_covariance, read_frame_poses, read_trajectory
 from nolbo_ppl.io.trajectory_tables import TableFormat
 
 
@@ -45,6 +46,8 @@ class SlamRunConfig:
     """How far, in s, a frame and its true pose may lie apart."""
     model: str | None = None
     """Model (a name or a folder) that decodes the landmarks' latents into landmarks_voxels.npz."""
+    mcap: bool = False
+    """Also write trajectory and map as map.mcap, for Foxglove and rviz (extra `ros`)."""
     online: bool = False
     """Run keyframe by keyframe on iSAM2."""
     config: SlamConfig = field(default_factory=SlamConfig)
@@ -95,6 +98,9 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
 
     report = write_result(folder, result, odometry, truth, model=model)
     draw_slam_result(folder / "map.png", odometry.T_world_camera, result, truth)
+    if arguments.mcap:
+        corrected = Trajectory(result.T_world_camera, odometry.times)
+        write_map_mcap(folder / MCAP, corrected, result.landmarks, odometry.T_world_camera)
     return result, report | {"remarks": remarks}
 
 

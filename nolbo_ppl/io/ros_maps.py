@@ -33,6 +33,8 @@ WORLD, CAMERA, UPRIGHT = "nolbo_world", "nolbo_camera", "map"
 """Frames: the odometry's world (x right, y down, z forward), the camera, and the world as robots have it (z up)."""
 R_UPRIGHT_WORLD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """x forward, y left, z up of x right, y down, z forward."""
+R_OBJECT_ROS = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""An object's axes as ROS has them (x to its front, y to its left, z up) in ours (front -y, z up)."""
 UNKNOWN_SIZE = 0.3
 """Side of the box of a landmark whose size nobody stated, m."""
 PALETTE = ((0.12, 0.47, 0.71), (0.89, 0.47, 0.13), (0.17, 0.63, 0.17), (0.58, 0.40, 0.74), (0.55, 0.34, 0.29), (0.89, 0.47, 0.76))
@@ -105,7 +107,8 @@ class _Messages:
                     R = one.T_world_object[:3, :3]
                     table[3:, 3:] = R @ one.covariance[:3, :3] @ R.T  # ROS states it about the axes of the fixed frame
                 covariance = table.ravel()
-            pose = self.make("geometry_msgs/PoseWithCovariance", self.pose(one.T_world_object), covariance)
+            T = one.T_world_object @ make_pose(R_OBJECT_ROS, np.zeros(3))
+            pose = self.make("geometry_msgs/PoseWithCovariance", self.pose(T), covariance)
             likely = one.class_posterior or {one.category or "object": 1.0}
             existence = one.existence if np.isfinite(one.existence) else 1.0
             results = [
@@ -116,8 +119,8 @@ class _Messages:
                 )
                 for name, p in sorted(likely.items(), key=lambda item: -item[1])
             ]
-            size = np.zeros(3) if one.size is None else one.size
-            box = self.make("vision_msgs/BoundingBox3D", self.pose(one.T_world_object), self.vector("Vector3", size))
+            size = np.zeros(3) if one.size is None else one.size[[1, 0, 2]]
+            box = self.make("vision_msgs/BoundingBox3D", self.pose(T), self.vector("Vector3", size))
             found.append(self.make("vision_msgs/Detection3D", self.header(time, WORLD), results, box, one.name))
         return self.make("vision_msgs/Detection3DArray", self.header(time, WORLD), found)
 

@@ -152,3 +152,17 @@ def test_interruption_leaves_no_half_written_file(folder: Path, tmp_path: Path, 
         main([*arguments(folder, tmp_path), "--config.em-iterations", "1"])
     assert stop.value.code == 130
     assert not list(tmp_path.iterdir()), "a result is complete or absent"
+
+
+def test_the_map_as_mcap(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    from nolbo_ppl.io.ros_bags import Bag
+
+    main([*arguments(folder, tmp_path / "map"), "--mcap", "--config.em-iterations", "1", "--config.hypotheses", "1"])
+    times = read_trajectory(folder / "odometry.txt").times
+    assert times is not None
+    landmarks = json.loads((tmp_path / "map" / "landmarks.json").read_text())
+    with Bag(tmp_path / "map" / "map.mcap") as bag:
+        assert [time for time, _ in bag.raw("/tf")] == [round(t * 1e9) for t in times]
+        _, objects = next(bag.messages("/nolbo/objects"))
+    assert {one.id for one in objects.detections} <= {row["name"] for row in landmarks} and objects.detections

@@ -17,120 +17,20 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl.data.converters.coco_names import COCO_IDS, COCO_NAMES, HEIGHTS
 from nolbo_ppl.data.converters.kitti_tracking import car_rotation
-from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import read_json
+from nolbo_ppl.errors import InputError, input_error
+from nolbo_ppl.geometry.masks import MaskMoments, mask_moments
+from nolbo_ppl.io.fields import is_number, number_array
+from nolbo_ppl.io.files import read_json, read_jsonl
 from nolbo_ppl.io.images import natural
 from nolbo_ppl.io.text import read_words
 from nolbo_ppl.structures.detections import Detections
 
-DetectionFormat = Literal["coco", "yolo", "kitti", "omni3d", "oa-slam"]
-"""`coco`: results JSON; `yolo`: a folder of text files; `kitti`: label files, 2D and 3D; `omni3d`: annotations or Cube R-CNN's
-results; `oa-slam`: a list of `file_name` and `detections` with corners."""
-COCO_NAMES = [
-    "person",
-    "bicycle",
-    "car",
-    "motorcycle",
-    "airplane",
-    "bus",
-    "train",
-    "truck",
-    "boat",
-    "traffic_light",
-    "fire_hydrant",
-    "stop_sign",
-    "parking_meter",
-    "bench",
-    "bird",
-    "cat",
-    "dog",
-    "horse",
-    "sheep",
-    "cow",
-    "elephant",
-    "bear",
-    "zebra",
-    "giraffe",
-    "backpack",
-    "umbrella",
-    "handbag",
-    "tie",
-    "suitcase",
-    "frisbee",
-    "skis",
-    "snowboard",
-    "sports_ball",
-    "kite",
-    "baseball_bat",
-    "baseball_glove",
-    "skateboard",
-    "surfboard",
-    "tennis_racket",
-    "bottle",
-    "wine_glass",
-    "cup",
-    "fork",
-    "knife",
-    "spoon",
-    "bowl",
-    "banana",
-    "apple",
-    "sandwich",
-    "orange",
-    "broccoli",
-    "carrot",
-    "hot_dog",
-    "pizza",
-    "donut",
-    "cake",
-    "chair",
-    "couch",
-    "potted_plant",
-    "bed",
-    "dining_table",
-    "toilet",
-    "tv",
-    "laptop",
-    "mouse",
-    "remote",
-    "keyboard",
-    "cell_phone",
-    "microwave",
-    "oven",
-    "toaster",
-    "sink",
-    "refrigerator",
-    "book",
-    "clock",
-    "vase",
-    "scissors",
-    "teddy_bear",
-    "hair_drier",
-    "toothbrush",
-]
-"""The 80 categories of COCO in order."""
-# One a line, as the formatter has it.
-_ABSENT = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-COCO_IDS = dict(zip((k for k in range(1, 91) if k not in _ABSENT), COCO_NAMES))
-"""COCO's category numbers, which leave ten out."""
-HEIGHTS: dict[str, tuple[float, float]] = {
-    "person": (1.65, 0.2),
-    "bicycle": (1.05, 0.12),
-    "car": (1.53, 0.13),
-    "motorcycle": (1.2, 0.15),
-    "bus": (3.1, 0.3),
-    "truck": (2.9, 0.6),
-    "chair": (0.9, 0.12),
-    "couch": (0.85, 0.12),
-    "dining_table": (0.75, 0.08),
-    "bottle": (0.26, 0.06),
-    "cup": (0.1, 0.02),
-    "stop_sign": (0.75, 0.08),
-    "fire_hydrant": (0.75, 0.12),
-    "teddy_bear": (0.35, 0.12),
-}
-"""Height and its standard deviation by category, m: rough everyday values; those of one's own objects are better."""
+DetectionFormat = Literal["coco", "yolo", "kitti", "omni3d", "oa-slam", "lines"]
+"""`coco`: results JSON, boxes or masks; `yolo`: a folder of text files; `kitti`: label files, 2D and 3D; `omni3d`: annotations or
+Cube R-CNN's results; `oa-slam`: a list of `file_name` and `detections` with corners; `lines`: JSON Lines of boxes or masks (see
+`read_lines`)."""
 RIM = 2.0
 """Boxes that come this near to the image's edge, px, may be cut off: their height says nothing."""
 CENTRE_SHARE = 0.05
@@ -155,6 +55,16 @@ class ForeignDetections:
     """R_camera_object (front -y, z up)."""
     size: Float[np.ndarray, "n 3"]
     """Extent along the object's axes, m."""
+    mask_centre: Float[np.ndarray, "n 2"] | None = None
+    """Centre of mass of the object's pixels, px, where a mask is given, else NaN."""
+    covariance: Float[np.ndarray, "n 3 3"] | None = None
+    """Covariance of the position, m^2, where the detector states it, else NaN."""
+
+    @property
+    def centre(self) -> Float[np.ndarray, "n 2"]:
+        """Where the object's centre is seen, px: the centre of its mask, or else of its box."""
+        middle = 0.5 * (self.box[:, :2] + self.box[:, 2:])
+        return middle if self.mask_centre is None else np.where(np.isfinite(self.mask_centre), self.mask_centre, middle)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -169,6 +79,17 @@ class _Row:
     position: Sequence[float] | None = None
     rotation: np.ndarray | None = None
     size: Sequence[float] | None = None
+    mask: MaskMoments | None = None
+
+
+def _mask(value: Any, what: str, path: Path, line: int | None = None) -> MaskMoments | None:
+    """Moments of a mask. Raises `InputError` naming the file, and what it belongs to."""
+    if not value:
+        return None
+    try:
+        return mask_moments(value)
+    except InputError as error:
+        raise input_error(what, got=error, file=path, line=line) from None
 
 
 def _name(value: object, names: Sequence[str] | Mapping[int, str], where: dict[str, Any]) -> str:
@@ -189,11 +110,55 @@ def _coco(path: Path, names: Mapping[int, str] | None) -> list[_Row]:
         names = {int(c["id"]): str(c["name"]) for c in content.get("categories", [])} or names
         content = content.get("annotations", [])
     rows = []
-    for item in content:
-        x, y, w, h = item["bbox"]
+    for k, item in enumerate(content):
+        if item.get("iscrowd"):
+            continue  # a crowd is no object
+        mask = _mask(item.get("segmentation"), f"segmentation of detection {k}", path)
+        if item.get("bbox") is None and mask is not None:
+            box = mask.box.tolist()
+        else:
+            x, y, w, h = item["bbox"]
+            box = [x, y, x + w, y + h]
         image = images.get(item["image_id"], str(item["image_id"]))
         category = _name(item.get("category_name", item.get("category_id")), names or COCO_IDS, {"file": path})
-        rows.append(_Row(image, [x, y, x + w, y + h], float(item.get("score", 1.0)), category))
+        rows.append(_Row(image, box, float(item.get("score", 1.0)), category, mask=mask))
+    return rows
+
+
+LINE = ("frame", "image", "time", "id", "box", "mask", "score", "objectness", "category", "position", "rotation", "size")
+"""Fields of a line of boxes."""
+
+
+def read_lines(path: Path) -> list[_Row]:
+    """JSON Lines of boxes: `frame` (a number) or `image` (a name), `box` [x0, y0, x1, y1] px or `mask`, `category`, `score`.
+
+    A mask is COCO's: polygons, or `{"size": [h, w], "counts": ...}`; where there is no box, it is the mask's. `objectness` is
+    another name of `score`, 1 by default.
+
+    Raises:
+        InputError: a field that is missing, malformed or unknown; names file and line.
+    """
+    rows = []
+    for number, item in read_jsonl(path):
+        where: dict[str, Any] = {"file": path, "line": number}
+        unknown = sorted(set(item) - set(LINE))
+        if unknown:
+            raise input_error("unknown field", got=unknown, expected=f"some of {sorted(LINE)}", **where)
+        if item.get("position") is not None:
+            raise input_error("a box with a position", expected="boxes alone", do="nolbo slam reads such lines itself", **where)
+        mask = _mask(item.get("mask"), "mask", path, number)
+        box = number_array(item.get("box"), (4,), 1e6) if item.get("box") is not None else None if mask is None else mask.box
+        if box is None:
+            raise input_error("no box", got=item.get("box"), expected="`box` [x0, y0, x1, y1] in px, or `mask`", **where)
+        image = item.get("image") if item.get("frame") is None else item["frame"]
+        if isinstance(image, bool) or not isinstance(image, int | str) or (isinstance(image, int) and image < 0):
+            raise input_error("no image", got=image, expected="`frame`, a number from 0, or `image`, a name", **where)
+        score, category = item.get("score", item.get("objectness", 1.0)), item.get("category", "object")
+        if not is_number(score, 0, 1):
+            raise input_error("score", got=score, expected="0 to 1", **where)
+        if not isinstance(category, str):
+            raise input_error("`category` is no name", got=category, expected="a string", **where)
+        rows.append(_Row(str(image), box.tolist(), float(score), category.replace(" ", "_"), mask=mask))
     return rows
 
 
@@ -323,6 +288,8 @@ def read_foreign_detections(
             rows = _yolo(path, names, size)
         elif form == "kitti":
             rows = _kitti(path)
+        elif form == "lines":
+            rows = read_lines(path)
         else:
             rows = _omni3d(path, numbered)
         box = np.array([row.box for row in rows], dtype=np.float64).reshape(-1, 4)
@@ -350,6 +317,7 @@ def read_foreign_detections(
         position[order],
         np.array([unknown if rows[i].rotation is None else rows[i].rotation for i in order]).reshape(-1, 3, 3),
         np.array([rows[i].size or [np.nan] * 3 for i in order], dtype=np.float64).reshape(-1, 3),
+        np.array([np.full(2, np.nan) if (m := rows[i].mask) is None else m.centre for i in order]).reshape(-1, 2),
     )
 
 
@@ -389,7 +357,7 @@ def observations_of(
     """
     heights = HEIGHTS if heights is None else heights
     count = len(found)
-    centre = 0.5 * (found.box[:, :2] + found.box[:, 2:])
+    centre = found.centre
     extent = found.box[:, 2:] - found.box[:, :2]
     placed = np.isfinite(found.position).all(axis=1)
     known = np.array([c in heights for c in found.category], dtype=bool)
@@ -402,7 +370,7 @@ def observations_of(
     ray = np.column_stack([(centre - intrinsics[2:]) / intrinsics[:2], np.ones(count)])
     depth = intrinsics[1] * H / extent[:, 1]
     position = np.where(placed[:, None], found.position, depth[:, None] * ray)
-    covariance = np.full((count, 3, 3), np.nan)
+    covariance = np.full((count, 3, 3), np.nan) if found.covariance is None else found.covariance.copy()
     across = depth[:, None] * np.maximum(CENTRE_SHARE * extent, 1.0) / intrinsics[:2]
     for k in np.flatnonzero(keep & ~placed):
         along = ray[k] * depth[k] * np.hypot(spread[k] / H[k], CENTRE_SHARE)

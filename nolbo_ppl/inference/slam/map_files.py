@@ -15,6 +15,7 @@ from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.landmarks import Iterations, write_associations, write_iterations, write_landmarks, write_voxels
+from nolbo_ppl.io.ros_maps import MCAP
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.trajectory import known_rows, trajectory_errors
@@ -28,6 +29,7 @@ RESULT = (
     "iterations.npz",
     "summary.json",
     "map.png",
+    MCAP,
 )
 """Files of a result of SLAM."""
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.cli.convert import main
-from nolbo_ppl.data.converters.foreign_detections import COCO_IDS, observations_of, read_foreign_detections
+from nolbo_ppl.data.converters.coco_names import COCO_IDS
+from nolbo_ppl.data.converters.foreign_detections import observations_of, read_foreign_detections
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.observations import read_observations
 
@@ -175,3 +176,57 @@ def test_damage_is_named(tmp_path: Path, form: str, text: str, match: str) -> No
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError, match=match):
         read_foreign_detections(tmp_path / "a.json", form)  # type: ignore[arg-type]
+
+
+def test_masks_give_a_better_centre(tmp_path: Path) -> None:
+    """An L: its centre of mass is not that of its box; polygons, run lengths, a box of the file's own or the mask's."""
+    polygon = [[100.0, 100, 140, 100, 140, 110, 110, 110, 110, 160, 100, 160]]
+    pixels = np.zeros((480, 640), bool)
+    pixels[100:110, 100:140] = pixels[100:160, 100:110] = True
+    flat = pixels.T.ravel()
+    edges = np.flatnonzero(np.diff(flat)) + 1
+    counts = np.diff(np.concatenate([[0], edges, [flat.size]])).tolist()
+    centre = np.argwhere(pixels)[:, ::-1].mean(axis=0) + 0.5
+    rows = [
+        {"image_id": 0, "category_id": 62, "bbox": [100, 100, 40, 60], "score": 0.9, "segmentation": polygon},
+        {"image_id": 1, "category_id": 62, "score": 0.9, "segmentation": {"size": [480, 640], "counts": counts}},
+        {"image_id": 2, "category_id": 62, "bbox": [100, 100, 40, 60], "score": 0.9},
+        {
+            "image_id": 3,
+            "category_id": 62,
+            "bbox": [0, 0, 640, 480],
+            "iscrowd": 1,
+            "segmentation": {"size": [1, 1], "counts": [1]},
+        },
+    ]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    lines = [
+        {"frame": 0, "box": [100, 100, 140, 160], "mask": polygon, "category": "chair", "score": 0.9},
+        {"frame": 1, "mask": {"size": [480, 640], "counts": counts}, "category": "chair", "objectness": 0.9},
+        {"frame": 2, "box": [100, 100, 140, 160], "category": "chair", "score": 0.9},
+    ]
+    (tmp_path / "a.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    for name, form in (("a.json", "coco"), ("a.jsonl", "lines")):
+        found = read_foreign_detections(tmp_path / name, form)  # type: ignore[arg-type]
+        np.testing.assert_allclose(found.box, np.tile([100.0, 100, 140, 160], (3, 1)))
+        np.testing.assert_allclose(found.centre, [centre, centre, [120, 130]])
+        table, _ = observations_of(found, CAMERA)
+        ray = table.position[:, :2] / table.position[:, 2:]
+        np.testing.assert_allclose(ray * CAMERA[:2] + CAMERA[2:], found.centre)
+
+
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [
+        ('{"frame": 0}', "no box: expected `box`"),
+        ('{"box": [0, 0, 1, 1]}', "no image: expected `frame`"),
+        ('{"frame": 0, "box": [0, 0, 1, 1], "score": 2}', "score: got 2, expected 0 to 1"),
+        ('{"frame": 0, "box": [0, 0, 1, 1], "boxx": 2}', "unknown field"),
+        ('{"frame": 0, "box": [0, 0, 1, 1], "position": [0, 0, 1]}', "nolbo slam reads such lines itself"),
+        ('{"frame": 0, "mask": [[1, 2]]}', "a.json:1: mask: got polygon of a mask"),
+    ],
+)
+def test_damaged_lines_are_named(tmp_path: Path, line: str, match: str) -> None:
+    (tmp_path / "a.json").write_text(line + "\n")
+    with pytest.raises(InputError, match=match):
+        read_foreign_detections(tmp_path / "a.json", "lines")
