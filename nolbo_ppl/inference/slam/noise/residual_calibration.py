@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from nolbo_ppl.inference.slam.graph import widened
+from nolbo_ppl.inference.slam.graph import inflated
 from nolbo_ppl.inference.slam.noise.fitted_residuals import (
     block_ratio,
     fitted_residuals,
@@ -116,7 +116,7 @@ def calibrate(state: SlamState) -> SlamState:
         change = _change(ratio, "position", stated[rows], config.correct_scales, warnings)
         # Where nobody stated them, directions and depth are told apart: gaps between frames hold the odometry's steps as well.
         across, along_ray = (np.sqrt(width**2 * used) if np.isfinite(width) else change[1] for width in widths_by_ray(found))
-        free = widened(
+        free = inflated(
             noise.position_covariance,
             state.problem.observations.position,
             *(max(float(width), MIN_FACTOR) ** 2 for width in (across, along_ray)),
