@@ -59,6 +59,8 @@ class EvaluateConfig:
     """Labelled photographs in place of scenes: a COCO-style JSON file, or a folder with `val.json`; images lie in the folder
     `images` beside it. An image may name the categories it labels `exhaustive`ly, an annotation be `difficult` or have an
     `azimuth`, degrees."""
+    part: tuple[int, int] = (0, 1)
+    """Number of the first photograph and step to the next: with `1 3` the second, the fifth, ... are measured."""
     peer: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
     """ONNX file of a detector (YOLOX or PicoDet, COCO's categories) to measure on the same photographs; may be given several
     times (extra `detector`)."""
@@ -331,6 +333,7 @@ def _evaluate_photographs(config: EvaluateConfig, photographs: Path, folder: Pat
         threshold=config.threshold,
         batch=config.batch,
         count=count,
+        part=config.part,
         seed=config.seed,
         resamples=config.resamples,
     )

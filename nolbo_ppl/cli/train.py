@@ -13,6 +13,7 @@ import json
 import sys
 from collections.abc import Sequence
 
+from nolbo_ppl.training.photograph_fit import PARTS
 from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
 from nolbo_ppl.training.trainer import TrainSummary as TrainSummary
 from nolbo_ppl.training.trainer import run as run
@@ -29,7 +30,9 @@ def main(args: Sequence[str] | None = None) -> None:
         from nolbo_ppl.cli.evaluate import EvaluateConfig, photograph_table, run_photographs
 
         model = str(config.out / "model")
-        options = EvaluateConfig(config.out / "photographs", model, photographs=config.photographs, pictures=False)
+        options = EvaluateConfig(
+            config.out / "photographs", model, photographs=config.photographs, part=(1, PARTS), pictures=False
+        )
         sys.stdout.write(photograph_table(run_photographs(options), model) + "\n")
 
 

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from nolbo_ppl.data.converters.photographs import Photograph, read_photographs
 from nolbo_ppl.data.sequences.image_sequence import read_image
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.evaluation.peers import OnnxPeer
 from nolbo_ppl.evaluation.photograph_scores import (
     PhotographDetections,
@@ -80,6 +81,7 @@ def evaluate_photographs(
     threshold: float = 0.01,
     batch: int = 16,
     count: int | None = None,
+    part: tuple[int, int] = (0, 1),
     seed: int = 0,
     resamples: int = 500,
 ) -> PhotographEvaluation:
@@ -92,14 +94,18 @@ def evaluate_photographs(
         threshold: least objectness of a detection.
         batch: photographs that go through the network at once.
         count: at most this many photographs, evenly spread over the file.
+        part: number of the first photograph, and step to the next; the rest may have served to fit something.
         seed: of the bootstrap.
         resamples: of the bootstrap.
 
     Raises:
-        InputError: the file or an image cannot be used.
+        InputError: the file or an image cannot be used, or no such part.
     """  # fmt: skip
     categories = model.config.categories
     photos = read_photographs(path, categories=categories)
+    if not (part[1] >= 1 and 0 <= part[0] < len(photos)):
+        raise input_error("part of the photographs", got=part, expected=f"a number below {len(photos)} and a step of at least 1")
+    photos = photos[part[0] :: part[1]]
     if count is not None and count < len(photos):
         photos = [photos[k] for k in np.linspace(0, len(photos) - 1, count).round().astype(int)]
     answers: list[PhotographDetections] = []

@@ -145,7 +145,8 @@ class TrainConfig:
     evaluate_scenes: int = 512
     """Held-out scenes of each look; the calibration at the end uses all."""
     photographs: Path | None = None
-    """Labelled photographs (COCO-style JSON) that the finished model is measured on, as `nolbo evaluate --photographs` does."""
+    """Labelled photographs (COCO-style JSON), not trained on. A detector's evidence is fitted on every third, from the first; the
+    finished model is measured on every third, from the second, as `nolbo evaluate --photographs FILE --part 1 3` does."""
     evidence_scenes: int = 1200
     """Scenes of each data set, at most, from which a model with a detector learns to weigh its evidence at the end."""
     checkpoint_every: int = 100

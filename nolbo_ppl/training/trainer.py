@@ -11,16 +11,19 @@ from __future__ import annotations
 import os
 import time
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as distributed
 
 from nolbo_ppl._version import __version__
+from nolbo_ppl.data.converters.photographs import read_photographs
 from nolbo_ppl.data.loader import prefetch
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.posterior.model_folder import load, save
+from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.tensors import load_tensors, save_tensors
 from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.observation_model import Nolbo
@@ -31,6 +34,7 @@ from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.training.detector_file import adopt
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
 from nolbo_ppl.training.net2net import grow
+from nolbo_ppl.training.photograph_fit import PARTS, PhotographFit, adopt_fit, find_objects, fit_found
 from nolbo_ppl.training.stage_data import TrainingData
 from nolbo_ppl.training.stages import StageRun
 from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
@@ -102,17 +106,21 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
     if rank == 0:
         model.set_half_precision(False)
         weighed = weigh_evidence(model, data, config) if model.config.detector else {}
+        photographs = fit_photographs(model, config) if model.config.detector else {}
         calibration = Calibration()
         if any(stage.name != "shapes" for stage in stages):
             data.encode_shapes(model)
             summary.held_out = validate(model, data.validation(config.evaluate_scenes))
             with suppress(TooFewObjects):  # a small folder of a user's own: the scales stay as they were learnt
                 calibration = calibrate(model, data.validation(None))
+            if photographs:  # fitted within the evidence, for photographs and generated scenes apart
+                calibration = replace(calibration, objectness_slope=1.0, objectness_shift=0.0, label_slope=1.0)
         summary.seconds = time.perf_counter() - started
         meta = {
             "calibrated": calibration != Calibration(),
             "training": config.to_json(),
             "held_out": {**summary.held_out, **weighed},
+            "photographs": photographs,
             "versions": {"nolbo_ppl": __version__, "torch": torch.__version__},
         }
         save(config.out / "model", model, calibration, meta)
@@ -140,6 +148,29 @@ def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dic
     train, held_out = gathered(False), gathered(True)
     terms = fit_fusion(model, train, held_out, data.plain_generated(config.evidence_scenes), config.seed)
     return {f"evidence/{name}": value for name, value in terms.items()}
+
+
+def fit_photographs(model: Nolbo, config: TrainConfig) -> dict[str, Any]:
+    """Fit how the detector's evidence is read on photographs (`nolbo_ppl.training.photograph_fit`), for the model's card.
+
+    Nothing is fitted without labelled photographs, or where they hold too few objects.
+    """
+    if config.photographs is None:
+        return {}
+    photos = read_photographs(config.photographs, categories=model.config.categories)[::PARTS]
+    made_of = {"file": str(config.photographs), "photographs": len(photos), "every": PARTS}
+    file = config.out / "photographs.json"
+    if file.is_file():
+        stored = read_json_object(file)
+        if stored.get("made_of") == made_of:  # a run that is resumed need not look at them again
+            adopt_fit(model, PhotographFit(**stored["fit"]))
+            return stored["fit"]
+    fit = fit_found(find_objects(model, photos), photos)
+    if fit is None:
+        return {}
+    adopt_fit(model, fit)
+    write_json(file, {"made_of": made_of, "fit": asdict(fit)})
+    return asdict(fit)
 
 
 def _train_stage(
