@@ -49,6 +49,8 @@ class OdometryNoise:
     """The same in m per m of the step; both add in quadrature."""
     length_factor: float = 1.0
     """Factor on the length of every step: the scale error of a monocular camera, a worn wheel."""
+    scale_drift: float = 0.0
+    """Standard deviation of the change of that factor's log from one step to the next: monocular odometry whose scale drifts."""
     planar: bool = False
     """Turn about the vertical and move in the horizontal plane only."""
 
@@ -113,6 +115,7 @@ def check(config: SimulateConfig) -> None:
         "--odometry.rotation-scale": config.odometry.rotation_scale,
         "--odometry.translation-scale": config.odometry.translation_scale,
         "--odometry.translation-ratio": config.odometry.translation_ratio,
+        "--odometry.scale-drift": config.odometry.scale_drift,
     }
     for name, value in scales.items():
         if not (math.isfinite(value) and value >= 0):
@@ -160,6 +163,7 @@ def simulate(config: SimulateConfig) -> SimulatedSequence:
         translation_ratio=noise.translation_ratio,
         planar=noise.planar,
         length_scale=noise.length_factor,
+        scale_drift=noise.scale_drift,
     )
     table, source = simulate_detections(truth, world, config.detector, rng)
     if not config.state_scales:

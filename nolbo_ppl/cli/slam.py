@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,6 +50,8 @@ class SlamRunConfig:
     """Also write trajectory and map as map.mcap, for Foxglove and rviz (extra `ros`)."""
     online: bool = False
     """Run keyframe by keyframe on iSAM2."""
+    scale_drift: bool = False
+    """The odometry is a single camera's: its unit of length is unknown and wanders. The same as `--config.scale-drift`."""
     config: SlamConfig = field(default_factory=SlamConfig)
     """Settings."""
 
@@ -88,12 +90,13 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
         from nolbo_ppl.inference.posterior.model_folder import load
 
         model = load(arguments.model)  # before the solve: a wrong name should not cost a run
+    config = replace(arguments.config, scale_drift=True) if arguments.scale_drift else arguments.config
     if arguments.online:
         from nolbo_ppl.inference.slam.incremental.incremental_slam import solve_incremental
 
-        result = solve_incremental(problem, arguments.config)
+        result = solve_incremental(problem, config)
     else:
-        result = solve(problem, arguments.config)
+        result = solve(problem, config)
     from nolbo_ppl.viz.map_plots import draw_slam_result
 
     report = write_result(folder, result, odometry, truth, model=model)

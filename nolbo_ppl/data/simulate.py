@@ -131,12 +131,14 @@ def simulate_odometry(
     translation_ratio: float = 0.0,
     planar: bool = False,
     length_scale: float = 1.0,
+    scale_drift: float = 0.0,
 ) -> Float[np.ndarray, "n 4 4"]:
     """Chain the true steps with white noise on each: rad an axis, m an axis, and m an axis per m of the step.
 
     Args:
         planar: turn about the camera's vertical axis only, move in its horizontal plane only.
         length_scale: factor on every step, the scale error of a monocular camera.
+        scale_drift: standard deviation of the change of that factor's log from one step to the next.
     """
     steps = relative(truth[:-1], truth[1:]).copy()
     length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
@@ -146,7 +148,12 @@ def simulate_odometry(
     if planar:
         noise[:, [0, 2, 4]] = 0.0
     steps[:, :3, 3] *= length_scale
-    return chain(truth[0], steps @ se3_exp(noise))
+    noise = se3_exp(noise)
+    if scale_drift:  # draws nothing without, so that odometry without stays what it was
+        wander = np.exp(np.cumsum(scale_drift * rng.standard_normal(n)))
+        steps[:, :3, 3] *= wander[:, None]
+        noise[:, :3, 3] *= length_scale * wander[:, None]
+    return chain(truth[0], steps @ noise)
 
 
 def simulate_detections(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,6 +43,9 @@ class RunConfig:
     """Observation model: name of weights in the package, or a folder."""
     online: bool = field(default=False, metadata=affects("slam"))
     """Run keyframe by keyframe on iSAM2 instead of in one batch."""
+    scale_drift: bool = field(default=False, metadata=affects("slam"))
+    """The odometry's unit of length is unknown and wanders, as a single camera's does: its scale is estimated at every step.
+    The same as `--slam.scale-drift`."""
     camera_height: float | None = field(default=None, metadata=affects("odometry"))
     """Height of the camera over the ground, m: gives visual odometry its scale."""
     camera_pitch: float = field(default=0.0, metadata=affects("odometry"))
@@ -86,6 +90,8 @@ class RunConfig:
     """Settings of the EM."""
 
     def __post_init__(self) -> None:
+        if self.scale_drift and not self.slam.scale_drift:
+            object.__setattr__(self, "slam", dataclasses.replace(self.slam, scale_drift=True))
         if self.every < 1:
             raise input_error("--every", got=self.every, expected="at least 1")
         if not 0 < self.threshold < 1:

@@ -12,6 +12,7 @@ from nolbo_ppl.cli.simulate import SimulateConfig, simulate
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig
 from nolbo_ppl.data.simulated_paths import circle, figure_of_eight, room, straight
 from nolbo_ppl.geometry.pose import inverse, is_rotation, relative, transform
+from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.io.observations import read_observations
 from nolbo_ppl.io.trajectories import read_trajectory
 
@@ -120,3 +121,20 @@ def test_options_out_of_range_are_named(
     assert stop.value.code == 2
     assert name in capsys.readouterr().err
     assert not (tmp_path / "world").exists()
+
+
+def test_scale_drift_is_simulated_and_solved(tmp_path: Path) -> None:
+    options = ["--odometry.scale-drift", "0.01", "--odometry.length-factor", "0.3", "--laps", "2"]
+    main(["simulate", "--out", str(tmp_path / "world"), *SMALL, *options])
+    world, given = tmp_path / "world", ["--odometry", str(tmp_path / "world/odometry.txt")]
+    given += ["--observations", str(world / "observations.jsonl"), "--truth", str(world / "truth.txt"), "--scale-drift"]
+    main(["slam", *given, "--out", str(tmp_path / "map")])
+    summary = json.loads((tmp_path / "map/summary.json").read_text())
+    assert summary["after"]["ate"] < 0.2 * summary["before"]["ate"]
+    with Npz(tmp_path / "map/scale.npz") as archive:
+        scale, deviation = archive.array("scale"), archive.array("standard_deviation")
+    assert scale.shape == deviation.shape == (39,)
+    assert summary["scale"]["median"] == pytest.approx(np.median(scale)) and (deviation > 0).all()
+    with pytest.raises(SystemExit) as error:
+        main(["slam", *given, "--online", "--out", str(tmp_path / "online")])
+    assert error.value.code == 2

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -160,7 +161,8 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
     config = state.config
     rng = np.random.default_rng([config.seed, state.iteration])
     graph = base_graph(state)
-    linked = graph.clone()
+    linked = gtsam.NonlinearFactorGraph()
+    linked.push_back(graph)  # shares the factors; those written in Python cannot be cloned
     add_landmark_equalities(linked, state.links, config.robust_width)
     linearisation = linearise(linked, state.estimate)
     if state.iteration and state.iteration % 2 == 0:

@@ -21,6 +21,7 @@ from nolbo_ppl.errors import NolboError
 from nolbo_ppl.geometry.pose import make_pose, relative
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import resolve_modes
+from nolbo_ppl.inference.slam.scale_state import add_scale_walk, scale_key, scaled_step_factor
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
 UNINFORMATIVE_ROTATION_SIGMA = 10.0
@@ -43,6 +44,8 @@ class SlamEstimate:
     """Camera poses."""
     T_world_landmark: Float[np.ndarray, "m 4 4"]
     """Landmark poses; the rotation means nothing where none is observed."""
+    scale: Float[np.ndarray, " n-1"] | None = None
+    """Factor on the length of each odometry step, where that is a state (`scale_state`)."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ def resolve_observations(
 
 
 def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.NonlinearFactorGraph:
-    """Gauge prior on the first pose and one factor a step."""
+    """Gauge prior on the first pose, one factor a step, and the random walk of their scales where scale drifts."""
     graph = gtsam.NonlinearFactorGraph()
     graph.add(
         gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(problem.odometry[0]), gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SCALE))
@@ -154,7 +157,12 @@ def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.Nonlinear
             model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
         else:
             model = gtsam.noiseModel.Gaussian.Covariance(sigmas[:, None] * noise.step_correlation[i] * sigmas)
-        graph.add(gtsam.BetweenFactorPose3(pose_key(i), pose_key(i + 1), gtsam.Pose3(step), model))
+        if noise.scale_walk is None:
+            graph.add(gtsam.BetweenFactorPose3(pose_key(i), pose_key(i + 1), gtsam.Pose3(step), model))
+        else:
+            graph.add(scaled_step_factor(pose_key(i), pose_key(i + 1), i, step, model))
+    if noise.scale_walk is not None:
+        add_scale_walk(graph, len(steps), noise.scale_walk)
     return graph
 
 
@@ -212,14 +220,17 @@ def to_values(estimate: SlamEstimate) -> gtsam.Values:
         values.insert(pose_key(i), gtsam.Pose3(T))
     for j, T in enumerate(estimate.T_world_landmark):
         values.insert(landmark_key(j), gtsam.Pose3(T))
+    for i, scale in enumerate(() if estimate.scale is None else estimate.scale):
+        values.insert(scale_key(i), np.array([scale]))
     return values
 
 
-def from_values(values: gtsam.Values, poses: int, landmarks: int) -> SlamEstimate:
+def from_values(values: gtsam.Values, poses: int, landmarks: int, scales: int | None = None) -> SlamEstimate:
     """An estimate of GTSAM values."""
     camera = np.array([values.atPose3(pose_key(i)).matrix() for i in range(poses)]).reshape(poses, 4, 4)
     landmark = np.array([values.atPose3(landmark_key(j)).matrix() for j in range(landmarks)]).reshape(landmarks, 4, 4)
-    return SlamEstimate(camera, landmark)
+    scale = None if scales is None else np.array([values.atVector(scale_key(i))[0] for i in range(scales)])
+    return SlamEstimate(camera, landmark, scale)
 
 
 def named_error(error: RuntimeError) -> GraphError:
@@ -249,14 +260,16 @@ def optimize(
         raise named_error(error) from None
     if not np.isfinite(after) or after > before:
         return estimate, before, before
-    return from_values(result, len(estimate.T_world_camera), len(estimate.T_world_landmark)), before, after
+    scales = None if estimate.scale is None else len(estimate.scale)
+    return from_values(result, len(estimate.T_world_camera), len(estimate.T_world_landmark), scales), before, after
 
 
 @dataclass(frozen=True)
 class Linearisation:
     """A linearised graph, factorised once: samples, marginals and joint covariances of any variables.
 
-    Columns of the system: landmarks in order, then poses in order (GTSAM sorts its keys: 'l' before 'x'), six each.
+    Columns of the system: landmarks in order, then poses in order (GTSAM sorts its keys: 'l' before 'x'), six each; then the
+    scales of the odometry's steps ('z'), where they are a state.
     """
 
     landmarks: int
@@ -273,7 +286,8 @@ class Linearisation:
     def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
         """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""
         noise = rng.standard_normal((self.jacobian.shape[0], count))
-        delta = self.factor.solve(self.jacobian.T @ noise).reshape(-1, 6, count)
+        blocks = 6 * (self.landmarks + self.poses)
+        delta = self.factor.solve(self.jacobian.T @ noise)[:blocks].reshape(-1, 6, count)
         return delta[self.landmarks :], delta[: self.landmarks]
 
     def residual_samples(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "r s"]:
@@ -298,6 +312,17 @@ class Linearisation:
                 out[start + k] = solution[6 * block : 6 * block + 6, 6 * k : 6 * k + 6]
         return 0.5 * (out + np.swapaxes(out, 1, 2))
 
+    def scale_deviations(self) -> Float[np.ndarray, " n-1"]:
+        """Standard deviations of the scales of the odometry's steps; none where they are no state."""
+        first, size = 6 * (self.landmarks + self.poses), self.jacobian.shape[1]
+        variance = np.empty(size - first)
+        for start in range(first, size, 384):
+            columns = np.arange(start, min(start + 384, size))
+            right = np.zeros((size, len(columns)))
+            right[columns, np.arange(len(columns))] = 1.0
+            variance[columns - first] = self.factor.solve(right)[columns, np.arange(len(columns))]
+        return np.sqrt(np.maximum(variance, 0.0))
+
     def log_determinant(self) -> float:
         """Log determinant of the normal matrix."""
         return float(np.sum(np.log(np.abs(self.factor.U.diagonal()))))
@@ -314,6 +339,7 @@ def linearise(graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate) -> Line
     except RuntimeError as error:
         raise named_error(error) from None
     size = 6 * (len(estimate.T_world_camera) + len(estimate.T_world_landmark))
+    size += 0 if estimate.scale is None else len(estimate.scale)
     system = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))
     jacobian = system[:, :size]
     # The last column is the right-hand side; GTSAM leaves it out where all residuals are zero.

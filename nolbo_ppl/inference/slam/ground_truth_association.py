@@ -13,6 +13,7 @@ from nolbo_ppl.inference.slam.graph import LandmarkEqualities, optimize
 from nolbo_ppl.inference.slam.initialise import SlamState, base_graph, first_estimate, tracklet_features
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
+from nolbo_ppl.inference.slam.noise.odometry_scale import metric_problem
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.tracking import Tracklets
 
@@ -31,7 +32,9 @@ def solve_with_associations(
     config = config or SlamConfig()
     if len(object_of) != len(problem.observations):
         raise input_error("associations do not match", got=len(object_of), expected=len(problem.observations))
-    noise = noise or estimate_noise(problem, config)
+    metric = metric_problem(problem, config)
+    problem = metric.problem
+    noise = noise or replace(estimate_noise(problem, config), scale_walk=metric.walk)
     prior = fit_prior(problem.observations, config, noise)
     measurements = resolve(problem.observations, noise, config, prior)
     rows = np.flatnonzero(object_of >= 0)
@@ -49,6 +52,7 @@ def solve_with_associations(
         np.bincount(landmark, minlength=count),
         np.zeros(count, bool),
     )
+    estimate = first_estimate(measurements, problem.odometry, config, rows, landmark, count)
     state = SlamState(
         problem=problem,
         config=config,
@@ -60,7 +64,8 @@ def solve_with_associations(
         landmark=landmark,
         weight=weight,
         features=features,
-        estimate=first_estimate(measurements, problem.odometry, config, rows, landmark, count),
+        estimate=replace(estimate, scale=None if metric.factor is None else np.ones(len(problem) - 1)),
+        odometry_scale=metric.factor,
         links=LandmarkEqualities.none(),
         typical_range=float(np.median(np.linalg.norm(problem.observations.position, axis=1))) if len(full) else 1.0,
     )

@@ -30,6 +30,7 @@ from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.absurd_values import without_absurd_values
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.noise.odometry_noise import odometry_by_evidence, stated_sigmas
+from nolbo_ppl.inference.slam.noise.odometry_scale import metric_problem
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
 from nolbo_ppl.inference.slam.orientation import OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
@@ -137,11 +138,13 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
         GraphError: GTSAM could not solve the graph.
     """
     problem, set_aside = without_absurd_values(problem)
+    metric = metric_problem(problem, config)
+    problem = metric.problem
     noise = estimate_noise(problem, config)
-    noise = replace(noise, warnings=(*set_aside, *noise.warnings))
+    noise = replace(noise, warnings=(*set_aside, *metric.warnings, *noise.warnings), scale_walk=metric.walk)
     prior = fit_prior(problem.observations, config, noise)
     tracklets = build_tracklets(problem, noise, config, prior)
-    state = init_from_tracklets(problem, config, noise, prior, tracklets)
+    state = init_from_tracklets(problem, config, noise, prior, tracklets, metric.factor)
     if all(stated_sigmas(problem, config)) or not len(tracklets):
         return state
     # Tracks were broken where the default scales were much too small: track once more with the better ones.
@@ -152,11 +155,17 @@ def init(problem: SlamProblem, config: SlamConfig) -> SlamState:
     if max(growth) < RETRACK:
         return state
     noise = replace(noise, rotation_step=state.noise.rotation_step, translation_step=state.noise.translation_step)
-    return init_from_tracklets(problem, config, noise, prior, build_tracklets(problem, noise, config, prior))
+    tracklets = build_tracklets(problem, noise, config, prior)
+    return init_from_tracklets(problem, config, noise, prior, tracklets, metric.factor)
 
 
 def init_from_tracklets(
-    problem: SlamProblem, config: SlamConfig, noise: NoiseModel, prior: FeaturePrior, tracklets: Tracklets
+    problem: SlamProblem,
+    config: SlamConfig,
+    noise: NoiseModel,
+    prior: FeaturePrior,
+    tracklets: Tracklets,
+    odometry_scale: Float[np.ndarray, " n-1"] | None = None,
 ) -> SlamState:
     """The second half of `init`, for tracklets that came from elsewhere (the online tracker)."""
     static = np.flatnonzero(~tracklets.moving)
@@ -167,6 +176,7 @@ def init_from_tracklets(
     landmark, weight = landmark[rows], tracklets.weight[rows]
     distance = np.linalg.norm(problem.observations.position, axis=1)
     measurements = resolve(problem.observations, noise, config, prior)
+    estimate = first_estimate(measurements, problem.odometry, config, rows, landmark, len(static))
     state = SlamState(
         problem=problem,
         config=config,
@@ -178,7 +188,8 @@ def init_from_tracklets(
         landmark=landmark,
         weight=weight,
         features=tracklet_features(measurements, config, prior, rows, landmark, weight, len(static)),
-        estimate=first_estimate(measurements, problem.odometry, config, rows, landmark, len(static)),
+        estimate=replace(estimate, scale=None if odometry_scale is None else np.ones(len(problem) - 1)),
+        odometry_scale=odometry_scale,
         links=LandmarkEqualities.none(),
         typical_range=float(np.median(distance)) if len(distance) else 1.0,
     )

@@ -30,7 +30,8 @@ def map_log_evidence(state: SlamState) -> float:
     """
     linearisation = linearise(base_graph(state), state.estimate)
     steps = len(state.problem) - 1
-    odometry = linearisation.residual[: 6 * (steps + 1)]
+    # Behind the odometry's rows those of the walk of its scales, where they are a state.
+    odometry = linearisation.residual[: 6 * (steps + 1) + (0 if state.estimate.scale is None else steps)]
     value = -0.5 * float(odometry @ odometry) - 3 * float(
         np.sum(np.log(state.noise.rotation_step)) + np.sum(np.log(state.noise.translation_step))
     )

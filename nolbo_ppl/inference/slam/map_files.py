@@ -13,8 +13,10 @@ import numpy as np
 from nolbo_ppl.inference.slam.hypotheses import ambiguity
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder
 from nolbo_ppl.inference.slam.slam_result import SlamResult
+from nolbo_ppl.inference.slam.slam_state import given_odometry
 from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.landmarks import Iterations, write_associations, write_iterations, write_landmarks, write_voxels
+from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.ros_maps import MCAP
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.metrics.association import association_pairs
@@ -27,6 +29,7 @@ RESULT = (
     "landmarks_voxels.npz",
     "associations.jsonl",
     "iterations.npz",
+    "scale.npz",
     "summary.json",
     "map.png",
     MCAP,
@@ -86,9 +89,16 @@ def summary(result: SlamResult, truth: np.ndarray | None = None) -> dict[str, An
         "versions": library_versions(),
         "configuration": {k: dict(v) if k == "category_symmetry" else v for k, v in asdict(state.config).items()},
     }
+    if result.scale is not None and result.scale_standard_deviation is not None and len(result.scale):
+        out["scale"] = {
+            "median": float(np.median(result.scale)),
+            "least": float(result.scale.min()),
+            "largest": float(result.scale.max()),
+            "standard_deviation": float(np.median(result.scale_standard_deviation)),
+        }
     if truth is not None:
         out["frames_with_truth"] = int(known_rows(truth).sum())
-        out["before"] = trajectory_errors(state.problem.odometry, truth)
+        out["before"] = trajectory_errors(given_odometry(state), truth)
         out["after"] = trajectory_errors(result.T_world_camera, truth)
     return out
 
@@ -120,6 +130,8 @@ def write_result(
         poses = np.stack([estimate.T_world_camera for estimate in result.history])
         landmarks = tuple(estimate.T_world_landmark[:, :3, 3] for estimate in result.history)
         write_iterations(out / "iterations.npz", Iterations(poses, landmarks))
+    if result.scale is not None and result.scale_standard_deviation is not None:
+        save_npz(out / "scale.npz", {"scale": result.scale, "standard_deviation": result.scale_standard_deviation})
     write_landmarks(out / "landmarks.json", result.landmarks)
     names = [landmark.name for landmark in result.landmarks]
     write_associations(out / "associations.jsonl", association_table(result), names)

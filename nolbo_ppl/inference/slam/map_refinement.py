@@ -13,7 +13,7 @@ from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections, rates_report
 from nolbo_ppl.inference.slam.em import make_landmark_equalities
 from nolbo_ppl.inference.slam.frame_model import exposures_of, initial_frame_model
-from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate, linearise, optimize
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, linearise, optimize
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
     base_graph,
@@ -60,7 +60,7 @@ def relabel(state: SlamState, cluster: Int[np.ndarray, " m"]) -> SlamState:
         features=features,
         links=LandmarkEqualities.none(),
         closed={},
-        estimate=estimate,
+        estimate=replace(estimate, scale=state.estimate.scale),
     )
 
 
@@ -146,7 +146,7 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
         landmark=landmark,
         weight=state.weight[rows],
         static=np.arange(count),
-        estimate=SlamEstimate(state.estimate.T_world_camera, state.estimate.T_world_landmark[keep]),
+        estimate=replace(state.estimate, T_world_landmark=state.estimate.T_world_landmark[keep]),
     )
     features = tracklet_features(state.measurements, state.config, state.prior, state.rows, landmark, state.weight, count)
     return replace(state, features=features)

@@ -42,7 +42,7 @@ from nolbo_ppl.inference.slam.orientation import (
     turn_shares,
     vertical_turns,
 )
-from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem, metric_odometry
 
 SMALLEST_WEIGHT = 1e-10
 """Weights below this are left out of the M-step."""
@@ -155,7 +155,7 @@ def em_init(
     Raises:
         InputError: the problem is malformed.
     """
-    noise = noise or estimate_noise(problem, config)
+    noise = noise or estimate_noise(problem, metric_odometry(config, "the reference EM"))
     table = problem.observations
     m = len(T_world_landmark)
     prior = fit_prior(table, config, noise)

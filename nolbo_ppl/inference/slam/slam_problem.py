@@ -28,6 +28,7 @@ _LIMITS: dict[str, tuple[float, float, bool]] = {
     "flip_probability": (0.0, 1.0, False),
     "orientation_outlier": (1e-12, 0.999, False),
     "category_error": (1e-9, 0.499, False),
+    "scale_walk": (1e-6, 1.0, False),
     "track_gap": (0, 10**9, True),
     "track_minimum": (1, 10**9, True),
     "motion_log_odds": (0.0, 1e12, False),
@@ -75,6 +76,10 @@ class SlamConfig:
     """Standard deviation of each coordinate of one odometry step, m."""
     odometry_translation_ratio: float | None = None
     """The part of it that grows with the length of the step, m per m."""
+    scale_drift: bool = False
+    """The odometry's unit of length is unknown and wanders, as a single camera's does: its scale is estimated at every step."""
+    scale_walk: float | None = None
+    """Standard deviation of the change of the log of that scale from one step to the next."""
     position_scale: float | None = None
     """Standard deviation of an observed position at range 0, m, for observations that state none."""
     position_ratio: float | None = None
@@ -159,6 +164,22 @@ class SlamConfig:
             raise input_error("objectness_prior", got=self.objectness_prior, expected="a share between 0 and 1")
         if self.field_of_view is not None and not all(0 < angle <= 2 * np.pi for angle in self.field_of_view):
             raise input_error("field_of_view", got=self.field_of_view, expected="two angles above 0 and at most 2 pi")
+
+
+def metric_odometry(config: SlamConfig, what: str) -> SlamConfig:
+    """The configuration, for what takes the odometry's lengths as metres.
+
+    Raises:
+        InputError: it asks for a scale that drifts.
+    """
+    if config.scale_drift:
+        raise input_error(
+            f"scale_drift in {what}",
+            got=True,
+            expected="odometry in metres",
+            do="use the batch solver, `solve` (without --online)",
+        )
+    return config
 
 
 STEP_SCALE_LIMITS = (1e-12, 1e6)
@@ -273,3 +294,5 @@ class NoiseModel:
     """The same for orientations."""
     step_correlation: Float[np.ndarray, "n-1 6 6"] | None = None
     """Covariance of each odometry step in units of its scales, where the problem states covariances."""
+    scale_walk: float | None = None
+    """Standard deviation of the change of the factor on the odometry's steps from one to the next; None: steps are metric."""

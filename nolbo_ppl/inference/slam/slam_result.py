@@ -91,6 +91,21 @@ class SlamResult:
             return mixture_covariances(self.hypotheses, self.T_world_camera, rows)
         return self.linearisation.covariance(self.linearisation.landmarks + rows)
 
+    @property
+    def scale(self) -> Float[np.ndarray, " n-1"] | None:
+        """Metres per unit of the odometry at each of its steps, with `SlamConfig.scale_drift`; else None."""
+        state = self.state
+        if state.odometry_scale is None or state.estimate.scale is None:
+            return None
+        return state.odometry_scale * state.estimate.scale
+
+    @cached_property
+    def scale_standard_deviation(self) -> Float[np.ndarray, " n-1"] | None:
+        """Posterior standard deviations of `scale`."""
+        if self.state.odometry_scale is None:
+            return None
+        return self.state.odometry_scale * self.linearisation.scale_deviations()
+
     def landmark_covariances(self) -> Float[np.ndarray, "m 6 6"]:
         """Covariances of all landmarks, [rotation rad, position m] in the object's own frame."""
         return self.linearisation.covariance(np.arange(self.linearisation.landmarks))

@@ -22,6 +22,7 @@ from nolbo_ppl.inference.slam.graph import (
 )
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
+from nolbo_ppl.inference.slam.noise.odometry_scale import rescaled
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.tracking import Tracklets
 
@@ -65,6 +66,9 @@ class SlamState:
     closed: dict[int, int] = field(default_factory=dict)
     """Tracklets closed by constellation, newer to older."""
 
+    odometry_scale: Float[np.ndarray, " n-1"] | None = None
+    """Factors the steps of the given odometry were multiplied by in `problem`, where its scale drifts (`scale_drift`)."""
+
     frame_model: FrameModel | None = None
     """Model of a frame's detections, once the map has been associated."""
 
@@ -77,6 +81,13 @@ class SlamState:
     def link_scale(self) -> float:
         """How much one object's measured position varies between passes, m: half the typical detection scale."""
         return link_scale(self.noise)
+
+
+def given_odometry(state: SlamState) -> Float[np.ndarray, "n 4 4"]:
+    """The odometry as it was handed in, in its own unit."""
+    if state.odometry_scale is None:
+        return state.problem.odometry
+    return rescaled(state.problem, 1.0 / state.odometry_scale).odometry
 
 
 def object_log_density(noise: NoiseModel) -> float:

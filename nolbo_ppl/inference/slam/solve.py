@@ -11,6 +11,7 @@ from nolbo_ppl.inference.slam.hypotheses import ambiguity, explore
 from nolbo_ppl.inference.slam.initialise import SlamState, first_estimate, init
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_result import SlamResult
+from nolbo_ppl.inference.slam.slam_state import given_odometry
 
 
 def iterate(
@@ -74,9 +75,7 @@ def complete(state: SlamState, on_step: Callable[[SlamState, EmStepInfo], None] 
         on_step: called after each iteration.
         hypotheses: runs at most (`solve` takes the configured number).
     """
-    start = first_estimate(
-        state.measurements, state.problem.odometry, state.config, state.rows, state.landmark, len(state.static)
-    )
+    start = first_estimate(state.measurements, given_odometry(state), state.config, state.rows, state.landmark, len(state.static))
     clock = time.perf_counter()
     config = state.config
     state = replace(state, config=replace(config, hypotheses=hypotheses))

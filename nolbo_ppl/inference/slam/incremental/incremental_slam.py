@@ -31,7 +31,13 @@ from nolbo_ppl.inference.slam.incremental.running_map import RunningMap, count_d
 from nolbo_ppl.inference.slam.initialise import init_from_tracklets
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
-from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem, check_step_covariance
+from nolbo_ppl.inference.slam.slam_problem import (
+    NoiseModel,
+    SlamConfig,
+    SlamProblem,
+    check_step_covariance,
+    metric_odometry,
+)
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.tracking import summarise_tracks
@@ -85,7 +91,7 @@ class IncrementalSlam(IncrementalMemory):
         calibration: SlamProblem | None = None,
         keyframes: KeyframeConfig | None = None,
     ) -> None:
-        super().__init__(config or SlamConfig(), keyframes or KeyframeConfig())
+        super().__init__(metric_odometry(config or SlamConfig(), "the online system"), keyframes or KeyframeConfig())
         self.calibration = calibration
 
     # -- one keyframe -------------------------------------------------------------------------------------------------

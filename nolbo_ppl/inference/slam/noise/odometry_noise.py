@@ -66,7 +66,12 @@ def densest_window(state: SlamState, length: int = WINDOW) -> SlamState:
         latent_scale=state.noise.latent_scale[state.rows[inside]],
     )
     problem = SlamProblem(state.problem.odometry[first : first + length], table)
-    estimate = SlamEstimate(state.estimate.T_world_camera[first : first + length], state.estimate.T_world_landmark[names])
+    scale = state.estimate.scale
+    estimate = SlamEstimate(
+        state.estimate.T_world_camera[first : first + length],
+        state.estimate.T_world_landmark[names],
+        None if scale is None else scale[first : first + length - 1],
+    )
     return replace(
         state,
         problem=problem,
