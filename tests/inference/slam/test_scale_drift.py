@@ -25,7 +25,7 @@ from nolbo_ppl.inference.slam import (
     SlamConfig,
     SlamProblem,
     SlamResult,
-    plain_init,
+    em_init,
     solve,
     solve_with_associations,
 )
@@ -151,7 +151,7 @@ def test_who_takes_lengths_as_metres_says_so() -> None:
     with pytest.raises(InputError, match=r"online.*batch"):
         IncrementalSlam(CONFIG)
     with pytest.raises(InputError, match=r"reference EM"):
-        plain_init(SlamProblem(world.odometry, world.observations), CONFIG, np.eye(4)[None])
+        em_init(SlamProblem(world.odometry, world.observations), CONFIG, np.eye(4)[None])
     with pytest.raises(InputError, match="scale_walk"):
         SlamConfig(scale_walk=0.0)
 
