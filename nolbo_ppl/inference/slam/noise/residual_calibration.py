@@ -91,7 +91,7 @@ def position_stated(state: SlamState) -> np.ndarray:
 def calibrate(state: SlamState) -> SlamState:
     """Fit position and rotation scales to the residuals about the solved tracks, and account for their correlation.
 
-    Scales nobody stated go up and down. Stated ones are widened only when they are too small by more than a third (reported)
+    Scales nobody stated go up and down. Stated ones are inflated only when they are too small by more than a third (reported)
     and `correct_scales`; too wide ones are reported.
     """
     noise, config = state.noise, state.config
