@@ -84,7 +84,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
     for _ in range(ROUNDS):
         score = model.log_score_ratio(seen)
         log_clutter = model.log_clutter(seen, log_density)
-        count, chance = of_detection.totals(model, n)
+        count, chance = of_detection.totals(model)
         chance = np.clip(chance, *PROBABILITY_LIMITS)
         log_once = model.log_pattern(np.ones(n), np.maximum(count, 1.0), chance) - np.log(chance)
         log_once[moving] = 0.0  # it was elsewhere

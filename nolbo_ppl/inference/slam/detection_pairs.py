@@ -16,6 +16,7 @@ from nolbo_ppl.geometry.pose import inverse, skew, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, weighted_latents
 from nolbo_ppl.inference.slam.gaussian import log_normal, squared_distance
 from nolbo_ppl.inference.slam.graph import Linearisation, inflated
+from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
@@ -60,9 +61,6 @@ def detection_pairs(state: SlamState, linearisation: Linearisation, rng: np.rand
     seen, estimate = state.measurements, state.estimate
     pose_delta, landmark_delta = linearisation.samples(min(state.config.samples, 48), rng)
     row, landmark = _near(state)
-    frame = seen.frame[row]
-    T_camera_world = inverse(estimate.T_world_camera[frame])
-    local = transform(T_camera_world, estimate.T_world_landmark[landmark, :3, 3])
     member = _member_weights(state, row, landmark)
     out: list[tuple[np.ndarray, ...]] = []
     R_landmark = estimate.T_world_landmark[:, :3, :3]
@@ -70,24 +68,28 @@ def detection_pairs(state: SlamState, linearisation: Linearisation, rng: np.rand
     exact = _exact_rows(state, member, landmark)
     for start in range(0, len(row), 20000):
         part = slice(start, start + 20000)
-        k, j, t, at = row[part], landmark[part], frame[part], local[part]
+        k, j = row[part], landmark[part]
+        t = seen.frame[k]
+        T_camera_world = inverse(estimate.T_world_camera[t])
+        at = transform(T_camera_world, estimate.T_world_landmark[j, :3, 3])
         # Deviation of the landmark in the camera's frame: R'(dp - R v) - omega x local.
-        deviation = np.einsum("pij,pjs->pis", T_camera_world[part, :3, :3], moved[j]) - pose_delta[t, 3:]
+        deviation = np.einsum("pij,pjs->pis", T_camera_world[:, :3, :3], moved[j]) - pose_delta[t, 3:]
         deviation -= np.cross(pose_delta[t, :3], at[:, :, None], axis=1)
         relative = deviation @ np.swapaxes(deviation, 1, 2) / deviation.shape[2]
         own = np.flatnonzero(exact[part])
         if len(own):
             relative[own] = relative_covariance(
-                linearisation, T_camera_world[part][own, :3, :3] @ R_landmark[j[own]], at[own], t[own], j[own]
+                linearisation, T_camera_world[own, :3, :3] @ R_landmark[j[own]], at[own], t[own], j[own]
             )
         error = at - seen.position[k]
         prediction, S = _without_own(state, k, member[part], error, relative)
         square, log_det = squared_distance(prediction, S)
-        inside = square < GATE
-        log_residual = log_normal(error, seen.covariance[k])
-        out.append((start + np.flatnonzero(inside), -0.5 * (square + log_det)[inside], log_residual[inside]))
-    use, log_position, log_residual = (np.concatenate(x) for x in zip(*out)) if out else (np.zeros(0, int), *np.zeros((2, 0)))
-    row, landmark, member, local = row[use], landmark[use], member[use], local[use]
+        inside = np.flatnonzero(square < GATE)
+        log_residual = log_normal(error[inside], seen.covariance[k[inside]])
+        out.append((start + inside, at[inside], -0.5 * (square + log_det)[inside], log_residual))
+    none = (np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    use, local, log_position, log_residual = (np.concatenate(x) for x in zip(*out)) if out else none
+    row, landmark, member = row[use], landmark[use], member[use]
     log_feature = feature_log_ratio(state, row, landmark, member)
     return DetectionPairs(row, landmark, member, local, log_position, log_feature, log_residual)
 
@@ -98,14 +100,7 @@ def _near(state: SlamState) -> tuple[np.ndarray, np.ndarray]:
     position = state.estimate.T_world_landmark[:, :3, 3]
     world = transform(state.estimate.T_world_camera[seen.frame], seen.position)
     reach = 5 * np.sqrt(np.trace(seen.covariance, axis1=1, axis2=2)) + 0.2 * np.linalg.norm(seen.position, axis=1)
-    rows, landmarks = [np.zeros(0, int)], [np.zeros(0, int)]
-    for start in range(0, len(seen), 2000):
-        part = slice(start, start + 2000)
-        square = np.sum(world[part] ** 2, axis=1)[:, None] + np.sum(position**2, axis=1) - 2 * world[part] @ position.T
-        i, j = np.nonzero(square < reach[part, None] ** 2)
-        rows.append(start + i)
-        landmarks.append(j)
-    return np.concatenate(rows), np.concatenate(landmarks)
+    return near_pairs(world, reach**2, position, np.zeros(len(position)))
 
 
 def _member_weights(state: SlamState, row: np.ndarray, landmark: np.ndarray) -> Float[np.ndarray, " p"]:

@@ -73,7 +73,7 @@ def existence_log_odds(
     whole = weight / np.clip(hits, 1e-12, 1.0)[j]
     np.add.at(information, j, whole[:, None, None] * (R @ np.linalg.inv(seen.covariance[k]) @ np.swapaxes(R, 1, 2)))
     value += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
-    number, mean = exposures.totals(model, m)
+    number, mean = exposures.totals(model)
     value += model.log_pattern(hits, np.maximum(number, hits), mean)
     return np.where(hits > 1e-6, value, NO_EVIDENCE)
 
@@ -90,7 +90,7 @@ def contribution(
     seen, m = state.measurements, len(state.estimate.T_world_landmark)
     k, j = pairs.row, pairs.landmark
     hits = np.bincount(j, weight, minlength=m).astype(np.float64)
-    number, mean = exposures.totals(model, m)
+    number, mean = exposures.totals(model)
     number = np.maximum(number, hits)
     without = np.maximum(hits[j] - weight, 0.0)
     pattern = model.log_pattern(hits, number, mean)[j] - model.log_pattern(without, number[j], mean[j])
@@ -109,7 +109,7 @@ def detected_log_odds(
     """`log r P_D / (1 - r P_D)` of each pair: existence r and detection probability as the other frames show them."""
     m = len(state.estimate.T_world_landmark)
     hits = np.bincount(pairs.landmark, weight, minlength=m).astype(np.float64)
-    number, _ = exposures.totals(model, m)
+    number, _ = exposures.totals(model)
     here = np.clip(model.probability(pairs.local), *PROBABILITY_LIMITS)
     others = np.maximum(hits[pairs.landmark] - weight, 0.0)
     total = np.maximum(np.maximum(number, hits)[pairs.landmark] - 1.0, others)

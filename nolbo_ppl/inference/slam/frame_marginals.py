@@ -9,10 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.association import association_marginals_batch
 from nolbo_ppl.inference.association.marginals import Associator
+
+SMALL_MATRIX = 1 << 14
+"""Pairs of a frame's detections and landmarks up to which they are one matrix."""
+LARGEST_MATRIX = 1 << 25
+"""Pairs of a part of a frame above which it is refused (0.3 GB)."""
 
 
 @dataclass(frozen=True)
@@ -59,20 +66,56 @@ def frame_marginals(
     groups = np.split(order, starts[1:]) if len(frames) else []
     by_row = np.argsort(row, kind="stable")
     sorted_rows = row[by_row]
-    problems, entries_of, place = [], [], []
-    for group in groups:
+    problems, entries_of, place, rows_of, frame_of = [], [], [], [], []
+    for f, group in enumerate(groups):
         low, high = np.searchsorted(sorted_rows, group, "left"), np.searchsorted(sorted_rows, group, "right")
         entries = np.concatenate([by_row[a:b] for a, b in zip(low, high)])
         columns, column = np.unique(landmark[entries], return_inverse=True)
-        dense = np.full((len(group), len(columns)), -np.inf)
         index = np.repeat(np.arange(len(group)), high - low)
-        dense[index, column] = log_likelihood[entries]
-        problems.append((dense, log_null[group]))
-        entries_of.append(entries)
-        place.append((index, column))
+        for rows, own in _parts(index, column, len(group), len(columns)):
+            local_row, local_column = np.searchsorted(rows, index[own]), column[own]
+            if len(rows) < len(group):
+                local_column = np.unique(local_column, return_inverse=True)[1]
+            dense = np.full((len(rows), int(local_column.max(initial=-1)) + 1), -np.inf)
+            dense[local_row, local_column] = log_likelihood[entries[own]]
+            problems.append((dense, log_null[group[rows]]))
+            entries_of.append(entries[own])
+            place.append((local_row, local_column))
+            rows_of.append(group[rows])
+            frame_of.append(f)
     weight, null = np.zeros(len(row)), np.ones(len(frame))
     results = association_marginals_batch(problems, associator=associator) if problems else []
-    for group, entries, (index, column), result in zip(groups, entries_of, place, results):
-        null[group] = result.null
+    for rows, entries, (index, column), result in zip(rows_of, entries_of, place, results):
+        null[rows] = result.null
         weight[entries] = np.asarray(result.weights)[index, column]
-    return FrameMarginals(weight, null, np.array([r.log_evidence for r in results]), all(r.exact for r in results))
+    evidence = np.bincount(np.array(frame_of, int), [r.log_evidence for r in results], minlength=len(frames)).astype(np.float64)
+    return FrameMarginals(weight, null, evidence, all(r.exact for r in results))
+
+
+def _parts(
+    row: Int[np.ndarray, " e"], column: Int[np.ndarray, " e"], rows: int, columns: int
+) -> list[tuple[Int[np.ndarray, " r"], Int[np.ndarray, " e"]]]:
+    """Rows and entries of the parts of a frame that have no landmark in common; one part where its matrix is small.
+
+    Raises:
+        InputError: a part is larger than `LARGEST_MATRIX`.
+    """
+    if rows * columns <= SMALL_MATRIX:
+        return [(np.arange(rows), np.arange(len(row)))]
+    links = scipy.sparse.coo_matrix((np.ones(len(row)), (row, rows + column)), shape=(rows + columns, rows + columns))
+    label = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+    by_row, by_entry = np.argsort(label[:rows], kind="stable"), np.argsort(label[row], kind="stable")
+    entry_label, out = label[row][by_entry], []
+    for part in np.split(by_row, np.flatnonzero(np.diff(label[by_row])) + 1):
+        low, high = np.searchsorted(entry_label, label[part[0]], "left"), np.searchsorted(entry_label, label[part[0]], "right")
+        own = by_entry[low:high]
+        size = (len(part), len(np.unique(column[own])))
+        if size[0] * size[1] > LARGEST_MATRIX:
+            raise input_error(
+                "too many detections of one frame that could be one another's",
+                got=f"{size[0]} detections and {size[1]} objects that hang together",
+                expected=f"at most {LARGEST_MATRIX} pairs",
+                do="state smaller position scales, or give fewer detections a frame",
+            )
+        out.append((part, own))
+    return out

@@ -19,6 +19,10 @@ from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 
 LINK_SHARE = 0.9
 """Most of a gap's information that is taken off for its own link: the rest is the sampled covariance's error."""
+CHUNK_PAIRS = 1 << 21
+"""Pairs of tracklets that are looked at together."""
+MAX_CANDIDATES = 256
+"""Older tracklets that are candidates for one: on many laps the number of all pairs grows with their square."""
 POSITION_GATE = 25.0
 """Squared Mahalanobis distance beyond which two tracklets are no candidates."""
 
@@ -188,17 +192,34 @@ def candidate_pairs(
     flat = samples.position.reshape(m, -1)
     norm = np.sum(flat**2, axis=1)
     square = np.sum(position**2, axis=1)
-    lists_a, lists_b = [], []
-    for start in range(0, m, 512):
-        rows = np.arange(start, min(start + 512, m))
+    chunk = int(np.clip(CHUNK_PAIRS // m, 1, 512))
+    found = []
+    for start in range(0, m, chunk):
+        rows = np.arange(start, min(start + chunk, m))
         trace = (norm[rows, None] + norm[None] - 2 * flat[rows] @ flat.T) / count
         distance = square[rows, None] + square[None] - 2 * position[rows] @ position.T
         near = distance <= POSITION_GATE * (np.maximum(trace, 0) * inflation + 3 * floor**2)
         near &= features.last[None] < features.first[rows, None]
         i, j = np.nonzero(near)
-        lists_a.append(rows[i])
-        lists_b.append(j)
-    a, b = np.concatenate(lists_a), np.concatenate(lists_b)
+        pairs = _with_evidence(rows[i], j, estimate, samples, features, prior, config, inflation, floor, links)
+        found.append(_best_of_each(pairs))
+    return Pairs(*(np.concatenate([getattr(p, name) for p in found]) for name in ("a", "b", "log_position", "log_feature")))
+
+
+def _with_evidence(
+    a: Int[np.ndarray, " p"],
+    b: Int[np.ndarray, " p"],
+    estimate: SlamEstimate,
+    samples: PosteriorSamples,
+    features: TrackletFeatures,
+    prior: FeaturePrior,
+    config: SlamConfig,
+    inflation: float,
+    floor: float,
+    links: LandmarkEqualities | None,
+) -> Pairs:
+    """Those of some pairs whose category and position allow it, with their evidence."""
+    position = estimate.T_world_landmark[:, :3, 3]
     compatible = prior.category_log_ratio(features.category[a], features.category[b]) > -20
     a, b = a[compatible], b[compatible]
     gap, covariance = position[a] - position[b], gap_covariance(samples, a, b)
@@ -211,6 +232,16 @@ def candidate_pairs(
     a, b = a[inside], b[inside]
     log_position = -0.5 * (square + log_det)[inside]
     return Pairs(a, b, log_position, feature_log_ratio(estimate, samples, features, prior, config, a, b))
+
+
+def _best_of_each(pairs: Pairs) -> Pairs:
+    """At most `MAX_CANDIDATES` older tracklets for each newer one, the best by evidence."""
+    if not len(pairs) or np.bincount(pairs.a).max() <= MAX_CANDIDATES:
+        return pairs
+    order = np.lexsort((-(pairs.log_position + pairs.log_feature), pairs.a))
+    a = pairs.a[order]
+    rank = np.arange(len(a)) - np.searchsorted(a, a, "left")
+    return pairs.select(np.sort(order[rank < MAX_CANDIDATES]))
 
 
 def feature_log_ratio(

@@ -84,7 +84,7 @@ def missed_log_ratio(state: SlamState, pairs: Pairs) -> Float[np.ndarray, " p"]:
     model = initial_frame_model(seen, state.config, len(state.problem))
     exposures = exposures_of(model, T_world_camera, place)
     hits = np.bincount(state.landmark, state.weight, minlength=m).astype(np.float64)
-    number, _ = exposures.totals(model, m)
+    number, _ = exposures.totals(model)
     # One probability for all: that of the map as it is, which duplicates make too low, not too high.
     chance = np.full(len(pairs), (hits.sum() + 1.0) / (np.maximum(number, hits).sum() + 2.0))
     a, b, count = hits[pairs.a], hits[pairs.b], np.maximum(number, hits)

@@ -17,6 +17,7 @@ from nolbo_ppl.inference.slam.detection_features import FeaturePrior, fuse_laten
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
+from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 
@@ -106,10 +107,9 @@ class Tracker:
 
     def _log_odds(self, seen: Measurements, modes: OrientationModes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of detections and tracks inside the gate and their log odds: density over that of any object, per m^3."""
-        gap = seen.position[:, None] - self.mean[None]
-        S = seen.covariance[:, None] + self.covariance[None]
-        k, j = np.nonzero(np.sum(gap**2, axis=2) <= GATE * np.trace(S, axis1=2, axis2=3))
-        square, log_det = squared_distance(gap[k, j], S[k, j])
+        traces = (GATE * np.trace(covariance, axis1=1, axis2=2) for covariance in (seen.covariance, self.covariance))
+        k, j = near_pairs(seen.position, next(traces), self.mean, next(traces))
+        square, log_det = squared_distance(seen.position[k] - self.mean[j], seen.covariance[k] + self.covariance[j])
         inside = square < GATE
         k, j = k[inside], j[inside]
         value = seen.log_object[k] - 0.5 * (square + log_det)[inside]
