@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
+from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.structures.detections import Detections
@@ -67,8 +67,13 @@ def one(arguments: Arguments) -> dict[str, float]:
         size, laps = arguments.sizes[0], arguments.laps
         per_lap = round(5000 * size / laps)
         truth = simulate_circuit(rng, laps=laps, radius=477 * size * 2 / laps, frames_per_lap=per_lap)
+        detector = DetectorConfig(maximum_range=40.0)
         drive = simulate_sequence(
-            truth, rng, world=WorldConfig(objects=round(3000 * size), latent_dim=8), odometry_rotation_scale=0.002
+            truth,
+            rng,
+            world=WorldConfig(objects=round(3000 * size), latent_dim=8),
+            detector=detector,
+            odometry_rotation_scale=0.002,
         )
         odometry, table = drive.odometry, drive.observations
     before, start = peak(), time.process_time()
