@@ -44,30 +44,34 @@ def image_levels(image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
     return tuple(levels)
 
 
-def cut_out(levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Crops:
+def cut_out(
+    levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"], side: int = SIDE, box_side: float = BOX_SIDE
+) -> Crops:
     """Cut objects out so that each box has the same longer side, its centre in the middle; beyond the image its border goes on.
 
     Args:
         levels: see `image_levels`.
         row: the image of each object.
         box: where it is, [x0, y0, x1, y1], px of the image.
+        side: height and width of a crop, px.
+        box_side: longer side of the object's box in it, px.
     """
     centre = (box[:, :2] + box[:, 2:]) / 2
     extent = (box[:, 2:] - box[:, :2]).clamp_min(1e-3)
-    factor = BOX_SIDE / extent.amax(-1).clamp_min(MIN_SIDE)
+    factor = box_side / extent.amax(-1).clamp_min(MIN_SIDE)
     level = (-torch.log2(factor)).round().long().clamp(0, len(levels) - 1)
-    step = torch.arange(SIDE, dtype=box.dtype) + 0.5 - SIDE / 2
+    step = torch.arange(side, dtype=box.dtype) + 0.5 - side / 2
     y, x = torch.meshgrid(step, step, indexing="ij")
     offset = torch.stack((x, y), -1).flatten(0, 1)
-    image = box.new_zeros(len(box), SIDE * SIDE, 3, dtype=levels[0].dtype)
+    image = box.new_zeros(len(box), side * side, 3, dtype=levels[0].dtype)
     for number, pixels in enumerate(levels):
         chosen = (level == number).nonzero().squeeze(-1)
         if len(chosen):
             points = centre[chosen, None] + offset / factor[chosen, None, None]
             image[chosen] = sample_map(pixels, row[chosen], points, 2**number)
     half = extent * (factor[:, None] / 2)
-    middle = torch.full_like(half, SIDE / 2)
-    crop = image.transpose(1, 2).unflatten(-1, (SIDE, SIDE)).contiguous(memory_format=torch.channels_last)
+    middle = torch.full_like(half, side / 2)
+    crop = image.transpose(1, 2).unflatten(-1, (side, side)).contiguous(memory_format=torch.channels_last)
     return Crops(crop, torch.cat((middle - half, middle + half), -1), factor)
 
 

@@ -196,7 +196,7 @@ class Guide(nn.Module):
         with scenes, pyro.plate("objects", assigned.shape[1], dim=-1), poutine.mask(mask=assigned):
             label = self._label(batch, q)
             latent = self._prior().category_dim
-            noise = batch.noise
+            noise = torch.zeros_like(q.shape_loc) if self.config.description.point else batch.noise
             pyro.sample(
                 "shape_latent",
                 NoisyNormal(

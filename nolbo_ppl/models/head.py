@@ -124,11 +124,14 @@ class RegionHead(nn.Module):
         angle_loc, angle_raw = angle.chunk(2, -1)
         box_loc, box_raw = box.chunk(2, -1)
         range_loc, range_raw = range_.chunk(2, -1)
+        method = self.config.description
+        if not method.describes:  # every category and every azimuth alike; the outputs stay without use
+            label, natural, angle_loc = torch.zeros_like(label), torch.zeros_like(natural), torch.zeros_like(angle_loc)
         return RegionParameters(
             label_logits=label,
             shape_loc=torch.softmax(label, -1) @ prior_mean.to(raw.dtype) + residual,
-            shape_scale=bounded_exp(shape_raw, -4.0, 2.0),
-            azimuth_logits=azimuth[..., :modes],
+            shape_scale=torch.ones_like(shape_raw) if method.point else bounded_exp(shape_raw, -4.0, 2.0),
+            azimuth_logits=azimuth[..., :modes] if method.describes else torch.zeros_like(azimuth[..., :modes]),
             azimuth_natural=natural,
             angle_loc=angle_loc,
             angle_scale=0.3 * bounded_exp(angle_raw, -3.0, 1.5),

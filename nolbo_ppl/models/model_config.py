@@ -9,6 +9,7 @@ from typing import Any, Literal
 from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.fields import check_fields
+from nolbo_ppl.models.baselines.method import METHODS, Method, MethodName
 
 LARGEST = 8192
 """Largest whole number a configuration may hold: widths, sides, labels; networks beyond do not fit any memory."""
@@ -97,7 +98,15 @@ class ModelConfig:
     detector: Literal["", "yolox_nano"] = ""
     """Detector whose predictions are evidence beside the tiny encoder's (`nolbo_ppl.models.hybrid_guide`); none by default."""
 
+    method: MethodName = "nolbo"
+    """The method, or one of those it is compared with (`nolbo_ppl.models.baselines.method`)."""
+
     def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise input_error("method", got=repr(self.method), expected=f"one of {list(METHODS)}")
+        if self.method != "nolbo" and (self.instances or self.detector):
+            got = "a detector" if self.detector else "instance labels"
+            raise input_error(f"method {self.method!r}", got=got, expected="neither instance labels nor a detector")
         if len(self.symmetry) != len(self.categories):
             raise input_error("one symmetry per category is needed", got=len(self.symmetry), expected=len(self.categories))
         if len(set(self.categories)) != len(self.categories) or not self.categories:
@@ -159,6 +168,11 @@ class ModelConfig:
                 raise input_error(name, got=getattr(self, name), expected="above 0")
         if not 0 < self.objectness_epsilon < 0.5:
             raise input_error("objectness_epsilon", got=self.objectness_epsilon, expected="a number in (0, 0.5)")
+
+    @property
+    def description(self) -> Method:
+        """What sets the method apart."""
+        return METHODS[self.method]
 
     @property
     def stride(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from nolbo_ppl.models.baselines.adversary import Discriminator
 from nolbo_ppl.models.generative import GenerativeModel
 from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.hybrid_guide import HybridGuide
@@ -21,6 +22,7 @@ class Nolbo(nn.Module):
         self.story = GenerativeModel(config)
         self.guide = HybridGuide(config, self.story.prior) if config.detector else Guide(config, self.story.prior)
         self.shape_guide = ShapeGuide(config)
+        self.discriminator = Discriminator(config) if config.description.adversary else None
 
     def set_half_precision(self, enabled: bool) -> None:
         """Run the networks' convolutions and dense layers in bfloat16 (weights, latents and the bound stay as they are)."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.scene_batch import SceneBatch
-from nolbo_ppl.models.shape_networks import PriorNetwork
+from nolbo_ppl.models.shape_networks import PriorNetwork, StandardPrior
 
 
 class LabelPrior(nn.Module):
@@ -26,7 +26,11 @@ class LabelPrior(nn.Module):
         super().__init__()
         self.category_dim, self.instance_dim = config.category_dim, config.instance_dim
         self.labels = len(config.categories)
-        self.category = PriorNetwork(self.labels, self.category_dim, config.prior_width)
+        self.category: PriorNetwork | StandardPrior = (
+            PriorNetwork(self.labels, self.category_dim, config.prior_width)
+            if config.description.label_prior
+            else StandardPrior(self.labels, self.category_dim)
+        )
         self.instance = PriorNetwork(len(config.instances), self.instance_dim, config.prior_width) if config.instances else None
         self.register_buffer("instance_category", torch.tensor(config.instance_category, dtype=torch.long), persistent=False)
 

@@ -29,6 +29,18 @@ class PriorNetwork(nn.Module):
         return self.layers(self.one_hot)
 
 
+class StandardPrior(nn.Module):
+    """Means of a prior that knows no labels: zero, N(0, I) for all."""
+
+    def __init__(self, labels: int, latent_dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(labels, latent_dim), persistent=False)
+
+    def forward(self) -> Float[Tensor, "labels latent_dim"]:
+        """The means of all labels."""
+        return self.mean
+
+
 class VoxelDecoder(nn.Module):
     """Latent -> logits of the occupancy of the canonical voxel grid, the generator of 3D-GAN with our input dimension.
 

@@ -69,13 +69,16 @@ class ShapeGuide(nn.Module):
     def posterior(self, packed: UInt8[Tensor, "n bytes"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
         """Mean and scale of the latent of each packed grid."""
         dtype = self.encoder.dense.weight.dtype
-        return self.encoder(unpack_bits(packed, self.config.voxel_size).to(dtype))
+        loc, scale = self.encoder(unpack_bits(packed, self.config.voxel_size).to(dtype))
+        return loc, torch.ones_like(scale) if self.config.description.point else scale
 
     def forward(self, batch: ShapeBatch) -> None:
         """The Pyro guide of `ShapeGenerativeModel`."""
         declare_parameters("guide", self)
         loc, scale = self.posterior(batch.voxels)
         noise = None if batch.noise is None else batch.noise[None]
+        if self.config.description.point:
+            noise = torch.zeros_like(loc)[None]
         with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(loc), dim=-1):
             pyro.sample("shape_latent", NoisyNormal(loc[None], scale[None], noise).to_event(1))
 

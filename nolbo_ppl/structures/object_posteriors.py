@@ -106,6 +106,9 @@ class ObjectPosteriors:
     """Posterior mean occupancy of the canonical grid; None when shapes were not decoded."""
     voxel_variance: Float[np.ndarray, "n v v v"] | None
     """Posterior variance of each voxel's occupancy probability over the shape latent."""
+    describes: bool = True
+    """The model states categories and viewpoints; without them all are equally likely here, and missing in detections
+    (`nolbo_ppl.models.baselines.method`)."""
 
     def __len__(self) -> int:
         return len(self.objectness)
@@ -124,7 +127,9 @@ class ObjectPosteriors:
 
     @property
     def category(self) -> list[str]:
-        """Maximum-likelihood category of each object, `argmax_l N(mu_q; mu_psi(l), I)`."""
+        """Maximum-likelihood category of each object, `argmax_l N(mu_q; mu_psi(l), I)`; "object" where none is stated."""
+        if not self.describes:
+            return ["object"] * len(self)
         return [self.categories[i] for i in self.class_log_likelihood.argmax(-1)]
 
     @property
@@ -171,6 +176,8 @@ class ObjectPosteriors:
             image: name of the image.
             time: its time, s.
         """
+        if not self.describes:
+            return self._undescribed(frame, image, time)
         n, labels = len(self), self.class_log_likelihood.argmax(-1)
         modes = self.rotation_modes()
         kept = modes.weights >= MIN_MODE_WEIGHT
@@ -209,6 +216,23 @@ class ObjectPosteriors:
             azimuth_weight=significant(self.viewpoint_modes.weights),
             azimuth=significant(self.viewpoint_modes.azimuth),
             azimuth_concentration=significant(self.viewpoint_modes.concentration),
+        )
+
+    def _undescribed(self, frame: int, image: str | None, time: float | None) -> Detections:
+        """Detections without category and orientation: box, position, size and latent."""
+        n = len(self)
+        return Detections.from_arrays(
+            np.full(n, frame),
+            significant(self.position),
+            position_covariance=significant(self.position_covariance, 10),
+            latent=significant(self.latent),
+            latent_scale=significant(self.latent_scale),
+            objectness=significant(self.objectness),
+            size=significant(self.size),
+            id=[f"{frame:06d}-{i:03d}" for i in range(n)],
+            image=[image] * n,
+            time=np.full(n, np.nan if time is None else time),
+            box=significant(self.box),
         )
 
     def to_records(self, frame: int, image: str) -> Iterator[dict[str, Any]]:

@@ -123,7 +123,23 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
             if batch.shape_index is not None:
                 add("shape_error", error)
                 add("shape_index", batch.shape_index[shaped])
-    return {name: torch.cat(values) for name, values in found.items()}
+                add("shape_latent", q.shape_loc[shaped] / q.shape_scale[shaped])
+    joined = {name: torch.cat(values) for name, values in found.items()}
+    if model.config.description.decoded and "shape_index" in joined:  # nothing but a shape's own views says where it lies
+        joined["shape_error"] = about_mean(joined["shape_latent"], joined["shape_index"])
+        joined["shape"] = joined["shape_error"].square().sum(-1)
+        joined["shape_index"] = torch.full((len(joined["shape"]),), -1)
+    return joined
+
+
+def about_mean(value: Float[Tensor, "n d"], group: Int[Tensor, " n"]) -> Float[Tensor, "m d"]:
+    """Deviations of members of groups from their mean, times sqrt(n / (n - 1)); groups of one, and -1, are left out."""
+    kept = group >= 0
+    value, (_, member, count) = value[kept], torch.unique(group[kept], return_inverse=True, return_counts=True)
+    mean = torch.zeros(len(count), value.shape[1], dtype=value.dtype).index_add_(0, member, value) / count[:, None]
+    several = count[member] > 1
+    n = count[member][several, None].to(value.dtype)
+    return (value - mean[member])[several] * (n / (n - 1)).sqrt()
 
 
 def _positions(

@@ -65,3 +65,29 @@ def adopt(model: Nolbo, initial: Nolbo, detector: str | os.PathLike[str] | None)
     model.load_state_dict(state)
     if detector is not None:
         model.guide.get_submodule("detector").load_state_dict(read_detector(detector).state_dict())
+
+
+FEATURES = ("guide.encoder.", "story.decoder.layers.", "shape_guide.encoder.layers.")
+"""Parts of the networks that features are: what depends neither on the latent nor on the method."""
+
+
+def adopt_features(model: Nolbo, initial: Nolbo) -> None:
+    """Give a model the features of another one; heads, latent and prior networks stay as they are.
+
+    Raises:
+        InputError: features of another size.
+    """
+    own = model.state_dict()
+    taken = {name: value for name, value in initial.state_dict().items() if name.startswith(FEATURES)}
+    wrong = sorted(
+        name
+        for name in {*taken, *(n for n in own if n.startswith(FEATURES))}
+        if name not in own or name not in taken or own[name].shape != taken[name].shape
+    )
+    if wrong:
+        raise input_error(
+            "features of the initial weights",
+            got=f"{len(wrong)} tensors of other shapes, {wrong[0]}",
+            do="give --preset of theirs",
+        )
+    model.load_state_dict({**own, **taken})

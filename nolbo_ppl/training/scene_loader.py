@@ -17,11 +17,17 @@ from nolbo_ppl.data.loader import Scenes, batch_indices
 from nolbo_ppl.data.mirror import mirror, mirror_voxels
 from nolbo_ppl.data.scene_cache import CachedScenes
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.models.baselines.single_object import one_object_batch
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
 from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
+
+JITTER_STREAM = 2**41
+"""Added to a step's number, it gives the random numbers that move the crops of objects."""
+BOX_JITTER = 0.08
+"""Standard deviation of what a crop's middle is moved by, in extents of its box, and of its box's log extents."""
 
 
 def to_batch(arrays: Arrays) -> SceneBatch:
@@ -177,6 +183,7 @@ class SceneLoader:
         known_instances: numbers below this are instance labels of the model.
         rank: number of this process.
         world: number of processes; each takes an equal part of the joint batch.
+        crop: side, px, of crops of one object a scene, in place of the scenes; 0 for the scenes.
     """
 
     def __init__(
@@ -192,12 +199,13 @@ class SceneLoader:
         known_instances: int = 0,
         rank: int = 0,
         world: int = 1,
+        crop: int = 0,
     ) -> None:
         if batch_size % world:
             raise input_error("batch size", got=batch_size, expected=f"a multiple of the {world} processes")
         self.scenes, self.table, self.batch_size, self.seed = scenes, table, batch_size, seed
         self.latent_dim, self.augmentation, self.known = latent_dim, augmentation, known_instances
-        self.size, self.sizes = size, tuple(sizes) if sizes else ()
+        self.size, self.sizes, self.crop = size, tuple(sizes) if sizes else (), crop
         self.part = slice(rank * batch_size // world, (rank + 1) * batch_size // world)
 
     def batch(self, step: int) -> SceneBatch:
@@ -215,13 +223,18 @@ class SceneLoader:
             batch = augment(batch, self.augmentation, seeds, size)
         noise = seeded_noise(self.seed, step, self.batch_size, batch.box.shape[1], self.latent_dim)
         order = seeded_noise(self.seed, step + DECODE_STREAM, self.batch_size, batch.box.shape[1])
-        return batch.replace(noise=noise[self.part], decode_order=order[self.part])
+        batch = batch.replace(noise=noise[self.part], decode_order=order[self.part])
+        if not self.crop:
+            return batch
+        jitter = BOX_JITTER * seeded_noise(self.seed, step + JITTER_STREAM, self.batch_size, 4)[self.part]
+        return one_object_batch(batch, self.crop, jitter)
 
     def prepared(self, index: Int[np.ndarray, " b"]) -> SceneBatch:
         """Scenes of these numbers without augmentation, with the teacher's latents."""
         batch = self._labelled(index)
         size = self._other(batch)
-        return batch if size is None else augment(batch, None, np.zeros(len(index), dtype=np.int64), size)
+        batch = batch if size is None else augment(batch, None, np.zeros(len(index), dtype=np.int64), size)
+        return one_object_batch(batch, self.crop) if self.crop else batch
 
     def _other(self, batch: SceneBatch) -> int | None:
         """The side images are brought to, or None where they have it."""

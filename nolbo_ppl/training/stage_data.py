@@ -146,6 +146,11 @@ class TrainingData:
             held_out_folder = SceneFolder(self.config.validation, self.model.categories, size=size, symmetry=self.model.symmetry)
             self._held_out, self._held_out_table = held_out_folder, ShapeTable(*held_out_folder.shapes())
 
+    @property
+    def _crop(self) -> int:
+        """Side of crops of one object, px; 0 where whole scenes are seen."""
+        return self.model.image_size if self.model.description.one_object else 0
+
     def batches(self, stage: str, start: int) -> Iterator[Any]:
         """Batches of a stage from a step on."""
         config, latent = self.config, self.model.latent_dim
@@ -166,7 +171,7 @@ class TrainingData:
         def loader_of(scenes: Scenes, table: ShapeTable, batch: int) -> SceneLoader:
             return SceneLoader(
                 scenes, table, batch, seed, latent, self.augmentation, self.model.image_size, config.sizes,
-                len(self.model.instances), self.rank, self.world,
+                len(self.model.instances), self.rank, self.world, crop=self._crop,
             )  # fmt: skip
 
         supply: SceneLoader | MixedSceneLoader
@@ -188,8 +193,9 @@ class TrainingData:
         parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
         for scenes, table in parts:
             supply = SceneLoader(
-                scenes, table, 64, 0, self.model.latent_dim, size=self.model.image_size, known_instances=len(self.model.instances)
-            )
+                scenes, table, 64, 0, self.model.latent_dim, size=self.model.image_size,
+                known_instances=len(self.model.instances), crop=self._crop,
+            )  # fmt: skip
             total = len(scenes) if count is None else min(-(-count // len(parts)), len(scenes))
             step = 64 if self.model.image_size <= 256 else 16
             for first in range(0, total, step):

@@ -13,10 +13,12 @@ from torch.nn.parallel import DistributedDataParallel
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import INCLUSIVE, PAPER, PURE_BOUND, ElboResult, SceneELBO, SceneLoss
 from nolbo_ppl.inference.svi import OptimizerConfig, OptimizerState
+from nolbo_ppl.models.baselines.method import MethodName
 from nolbo_ppl.models.normalisation import set_joint
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
+from nolbo_ppl.training.method_objectives import ADVERSARIAL_TERMS, AdversarialLoss, image_weights
 
 OBJECTIVES: dict[str, Mapping[str, float]] = {"inclusive": INCLUSIVE, "elbo": PURE_BOUND, "paper": PAPER}
 """Weights of the terms by the name of the objective."""
@@ -37,6 +39,8 @@ class TrainingStage:
     """Weights of the terms of the loss."""
     freeze: int = 0
     """Steps, from the first, during which decoder and prior networks stay as they are (normalisation included)."""
+    freeze_encoder: bool = False
+    """The image encoder stays as it is (normalisation included)."""
     decode: int = 0
     """Objects decoded a step; their voxel term stands for all objects. 0 where voxels have no weight."""
 
@@ -70,14 +74,19 @@ class StageRun:
         self._frozen: bool | None = None
         model.requires_grad_(True)
         model.set_half_precision(half_precision)
+        weights = {name: weight for name, weight in stage.weights.items() if name not in ADVERSARIAL_TERMS}
         if stage.name == "shapes":
             model.guide.requires_grad_(False)
-            module: nn.Module = ShapeLoss(model, SceneELBO(stage.weights))
+            module: nn.Module = ShapeLoss(model, SceneELBO(weights))
         else:
             model.shape_guide.requires_grad_(False)
             if stage.freeze >= stage.optimisation.steps:
                 model.story.requires_grad_(False)
-            module = SceneLoss(model.story, model.guide, SceneELBO(stage.weights))
+            if stage.freeze_encoder:
+                model.guide.encoder.requires_grad_(False)
+            module = SceneLoss(model.story, model.guide, SceneELBO(weights))
+        if len(weights) < len(stage.weights):
+            module = AdversarialLoss(module, model, stage.weights)
         together = distributed.is_available() and distributed.is_initialized()
         self._local = together and average_every > 1
         set_joint(model, not self._local)
@@ -95,6 +104,8 @@ class StageRun:
                 self.model.story.train(not frozen)
                 for parameter in self.model.story.parameters():
                     parameter.requires_grad_(not frozen)
+                if self.stage.freeze_encoder:
+                    self.model.guide.encoder.eval()
             self._frozen = frozen
         return frozen
 
@@ -123,12 +134,12 @@ class StageRun:
         self.model.load_state_dict(self.state.average)
 
 
-def scene_weights(objective: str, changes: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Weights of an objective, with other weights for some terms.
+def scene_weights(objective: str, changes: Mapping[str, float] | None = None, method: MethodName = "nolbo") -> dict[str, float]:
+    """Weights of an objective, with other weights for some terms; methods other than NOLBO have terms of their own.
 
     Voxel terms are thousands of nats an object while the latent is wrong: at full weight they drown every other head.
     """
-    weights = {**OBJECTIVES[objective], **(changes or {})}
+    weights = {**image_weights(method, OBJECTIVES[objective]), **(changes or {})}
     return {name: weight for name, weight in weights.items() if weight}
 
 

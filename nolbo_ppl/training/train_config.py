@@ -12,10 +12,11 @@ import tyro
 
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.svi import OptimizerConfig
+from nolbo_ppl.models.baselines.method import METHODS, MethodName
 from nolbo_ppl.models.model_config import PRESETS, ModelConfig
+from nolbo_ppl.training.method_objectives import shape_weights
 from nolbo_ppl.training.net2net import grown_config
 from nolbo_ppl.training.stages import TrainingStage, scene_weights
 
@@ -34,6 +35,8 @@ FREE_FIELDS = (
     "evaluate_every",
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
+NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False}
+"""Fields that a checkpoint need not name where they have these values, for the same reason as `OPTIONAL_FIELDS`."""
 OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes", "evidence_scenes")
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
@@ -61,6 +64,10 @@ class TrainConfig:
     weights of such a preset as `initial`."""
     objective: Literal["inclusive", "elbo", "paper"] = "inclusive"
     """What is maximised: the inclusive objective, the pure bound, or the paper's (the bound with objectness turned)."""
+    method: MethodName = "nolbo"
+    """What is trained: NOLBO, or what it is compared with on the same encoder and decoder (`nolbo_ppl.models.baselines.method`):
+    `single` (NOLBO on crops of one object), `ae` (2D-3D autoencoder), `vvae` (vanilla VAE), `tlnet` (TL-network), `vaegan`
+    (3D-VAE-GAN)."""
     orientation: Literal["mixture", "angle", "sincos"] | None = None
     """Form of the orientation latent; the preset's by default."""
     instance_labels: bool = False
@@ -96,6 +103,11 @@ class TrainConfig:
     initial: str | None = None
     """Weights to start from: a name of shipped weights, or the folder of a model; the networks' configuration is theirs.
     With `--shape-steps 0` the shape networks stay as they are."""
+    initial_part: Literal["all", "features"] = "all"
+    """What is taken of the initial weights: everything, or the features (image encoder, convolutions of decoder and 3D encoder),
+    for networks of the preset whose heads, latent and prior start afresh."""
+    freeze_encoder: bool = False
+    """The image encoder stays as it is: a quarter of the time a step, for comparing what is built on one encoder."""
     grow: bool = False
     """Grow the initial networks to the blocks and the second look of the preset (`nolbo_ppl.training.net2net`)."""
     cache: Path = DEFAULT_CACHE
@@ -169,6 +181,12 @@ class TrainConfig:
             raise input_error("mix", got=self.mix, expected="positive shares")
         if any(size % 32 or size <= 0 for size in self.render_sizes):
             raise input_error("render_sizes", got=self.render_sizes, expected="positive multiples of 32")
+        if self.initial_part != "all" and (self.initial is None or self.grow or self.preset == "photo"):
+            raise input_error(
+                "initial_part",
+                got=f"initial {self.initial}, grow {self.grow}, preset {self.preset}",
+                expected="--initial, neither --grow nor the preset photo",
+            )
         if self.detector is not None and self.preset != "photo":
             raise input_error("a detector", got=f"preset {self.preset}", do="add --preset photo")
         if self.instance_labels and (len(self.scenes) > 1 or self.generated):
@@ -246,8 +264,11 @@ class TrainConfig:
 
     def model(self) -> ModelConfig:
         """Configuration of the networks. Raises `InputError` where initial weights and other fields disagree."""
-        if self.start is not None:
+        if self.start is not None and self.initial_part == "all":
             config = load(self.start).config
+            if config.method != self.method:
+                got = f"weights of method {config.method}"
+                raise input_error("initial weights of another method", got=got, do="give --initial-part features")
             if self.orientation not in (None, config.orientation) or self.latent_dim not in (None, config.latent_dim):
                 raise input_error(
                     "initial weights of another form",
@@ -266,7 +287,7 @@ class TrainConfig:
             if self.grow:
                 config = grown_config(config, PRESETS[self.preset]())
             return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)
-        changes: dict[str, Any] = {}
+        changes: dict[str, Any] = {"method": self.method}
         if self.categories:
             changes["categories"], changes["symmetry"] = self.categories, self._symmetry()
         if self.image_size is not None:
@@ -284,25 +305,29 @@ class TrainConfig:
 
     def stages(self) -> list[TrainingStage]:
         """The stages that have steps."""
-        weights = scene_weights(self.objective, self.weights)
+        weights = scene_weights(self.objective, self.weights, self.method)
+        decoded = METHODS[self.method].decoded  # the decoder learns along
         images = OptimizerConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
         stages = [
             TrainingStage(
                 "shapes",
                 OptimizerConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
-                SHAPE_STAGE,
+                shape_weights(self.method),
             ),
             TrainingStage(
                 "single",
                 dataclasses.replace(images, steps=self.single_steps, decay=0.0, warmup=min(100, self.single_steps)),
                 weights,
-                freeze=self.single_steps,
+                freeze=0 if decoded else self.single_steps,
+                freeze_encoder=self.freeze_encoder,
+                decode=self.decode if decoded else 0,
             ),
             TrainingStage(
                 "scenes",
                 dataclasses.replace(images, steps=self.scene_steps, warmup=min(100, self.scene_steps)),
                 weights,
-                freeze=round(self.freeze * self.scene_steps),
+                freeze=0 if decoded else round(self.freeze * self.scene_steps),
+                freeze_encoder=self.freeze_encoder,
                 decode=self.decode if weights.get("voxels") else 0,
             ),
         ]
@@ -315,4 +340,5 @@ class TrainConfig:
     def identity(self) -> dict[str, Any]:
         """What a checkpoint must agree with: everything but the fields that do not touch what is learnt."""
         values = self.to_json()
-        return {k: v for k, v in values.items() if k not in FREE_FIELDS and (v or k not in OPTIONAL_FIELDS)}
+        left_out = {k for k, v in values.items() if (k in OPTIONAL_FIELDS and not v) or (k in NEW_FIELDS and v == NEW_FIELDS[k])}
+        return {k: v for k, v in values.items() if k not in FREE_FIELDS and k not in left_out}

@@ -31,7 +31,7 @@ from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
-from nolbo_ppl.training.detector_file import adopt
+from nolbo_ppl.training.detector_file import adopt, adopt_features
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.photograph_fit import PARTS, PhotographFit, adopt_fit, find_objects, fit_found
@@ -80,7 +80,10 @@ def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
         initial = load(config.start).model
         if config.grow:
             initial = grow(initial, model.config, config.seed)
-        adopt(model, initial, config.detector)
+        if config.initial_part == "features":
+            adopt_features(model, initial)
+        else:
+            adopt(model, initial, config.detector)
     training_logger = TrainingLogger(config, rank)
     stages = config.stages()
     first, tensors, at_step = training_logger.resume(model, stages)

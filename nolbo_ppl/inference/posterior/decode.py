@@ -92,6 +92,7 @@ def assemble(
         size=size,
         voxel_mean=voxel_mean,
         voxel_variance=voxel_variance,
+        describes=config.description.describes,
     )
 
 

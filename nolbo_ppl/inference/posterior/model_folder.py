@@ -11,6 +11,7 @@ import torch
 
 from nolbo_ppl.errors import InputError, input_error, located
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.inference.posterior.single_object_predictor import SingleObjectModel
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.io.tensors import check_tensors, file_hash, load_strictly, load_tensors, save_tensors
 from nolbo_ppl.models.model_config import ModelConfig
@@ -60,6 +61,8 @@ def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
         check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
     model = Nolbo.from_seed(config, seed=0)
     load_strictly(model, tensors, weights)
+    if config.description.one_object:  # the shipped scene network says where objects are
+        return SingleObjectModel(model, calibration, load("tiny"))
     return ObservationModel(model, calibration)
 
 

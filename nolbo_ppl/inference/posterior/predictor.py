@@ -178,14 +178,7 @@ class ObservationModel:
         batch: int,
     ) -> list[ObjectPosteriors]:
         """Run batches of images of one shape; `find` gives what to answer for."""
-
-        def shapes(q: RegionParameters, diagonal: Tensor) -> DecodedShape:
-            metres = diagonal.numpy()
-            if not decode:
-                return DecodedShape(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
-            decoder, side = self._networks.decoder, self.config.voxel_size
-            return sampled_shapes(decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
-
+        shapes = self._shapes(decode, samples, seed)
         results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
             encoding = self.encode(torch.stack([prepared[i].image for i in group]))
@@ -201,6 +194,18 @@ class ObservationModel:
             for k, i in enumerate(group):
                 results[i] = answer[slice(ends[k], ends[k + 1])]
         return [results[i] for i in range(len(prepared))]
+
+    def _shapes(self, decode: bool, samples: int, seed: int) -> Callable[[RegionParameters, Tensor], DecodedShape]:
+        """Shapes of regions from their posterior and diagonals, m."""
+
+        def shapes(q: RegionParameters, diagonal: Tensor) -> DecodedShape:
+            metres = diagonal.numpy()
+            if not decode:
+                return DecodedShape(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
+            decoder, side = self._networks.decoder, self.config.voxel_size
+            return sampled_shapes(decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
+
+        return shapes
 
     def _preprocess_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[PreprocessedImage]:
         return preprocess_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
