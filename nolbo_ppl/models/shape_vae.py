@@ -41,8 +41,13 @@ class ShapeGenerativeModel(nn.Module):
         super().__init__()
         self.story = story
 
-    def forward(self, batch: ShapeBatch) -> None:
-        """p(z | l) p(voxels | z) of each shape; an instance of -1 is "novel" here, the prior's zero mean."""
+    def forward(self, batch: ShapeBatch, decode: int | None = None) -> None:
+        """p(z | l) p(voxels | z) of each shape; an instance of -1 is "novel" here, the prior's zero mean.
+
+        Args:
+            batch: the shapes, in random order.
+            decode: only the first so many are decoded; their voxel term is scaled up to stand for all. None decodes all.
+        """
         declare_parameters("model", self.story)
         prior, size = self.story.prior, self.story.config.voxel_size
         with pyro.plate("scenes", 1, dim=-2), pyro.plate("objects", len(batch.voxels), dim=-1):
@@ -54,8 +59,9 @@ class ShapeGenerativeModel(nn.Module):
             category = latent[..., : prior.category_dim]
             squared = (category[..., None, :] - prior.category_mean()).square().sum(-1)
             pyro.sample("shape_label", dist.Categorical(logits=-0.5 * squared), obs=batch.category[None])
-        logits = self.story.decoder(latent[0])
-        voxel_site(logits, unpack_bits(batch.voxels, size).to(logits.dtype))
+        logits = self.story.decoder(latent[0, :decode])
+        observed = unpack_bits(batch.voxels[:decode], size).to(logits.dtype)
+        voxel_site(logits, observed, len(batch.voxels) / max(len(observed), 1))
 
 
 class ShapeGuide(nn.Module):
@@ -72,8 +78,8 @@ class ShapeGuide(nn.Module):
         loc, scale = self.encoder(unpack_bits(packed, self.config.voxel_size).to(dtype))
         return loc, torch.ones_like(scale) if self.config.description.point else scale
 
-    def forward(self, batch: ShapeBatch) -> None:
-        """The Pyro guide of `ShapeGenerativeModel`."""
+    def forward(self, batch: ShapeBatch, decode: int | None = None) -> None:
+        """The Pyro guide of `ShapeGenerativeModel`, whose argument `decode` is without use here."""
         declare_parameters("guide", self)
         loc, scale = self.posterior(batch.voxels)
         noise = None if batch.noise is None else batch.noise[None]

@@ -23,14 +23,16 @@ from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import SHAPE_STAGE
 from nolbo_ppl.inference.posterior.decode import category_log_likelihood
 from nolbo_ppl.inference.posterior.decoded_shapes import decode_latents
+from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.io.tensors import load_tensors, save_tensors
 from nolbo_ppl.metrics.voxel import voxel_iou
-from nolbo_ppl.models.model_config import ModelConfig, nano
+from nolbo_ppl.models.model_config import ModelConfig, nano, tiny
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import pack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.training.detector_file import SHAPE_FEATURES, adopt_features
 from nolbo_ppl.training.stages import StageRun, TrainingStage, seeded_noise
 
 
@@ -38,21 +40,21 @@ from nolbo_ppl.training.stages import StageRun, TrainingStage, seeded_noise
 class ShapeVaeConfig:
     """Training of the shape autoencoder on an archive of shapes."""
 
-    steps: int = 1500
+    steps: int = 500
     """Optimiser steps."""
     batch: int = 32
     """Shapes a step."""
     latent_dim: int = 16
     """Dimensions of the latent."""
-    encoder_channels: tuple[int, int, int] = (32, 48, 64)
-    """Channels of the 3D encoder."""
-    decoder_channels: tuple[int, int, int] = (64, 32, 16)
-    """Channels of the decoder."""
+    initial: str | None = "tiny"
+    """Weights whose convolutions of 3D encoder and decoder are started from; latent and prior start afresh. None for none."""
+    decode: int = 8
+    """Shapes decoded a step, which stand for all: the decoder costs four times what the encoder does."""
     learning_rate: float = 2e-3
     """Rate after the warm-up; it falls along a cosine over the second half."""
     shift: int = 1
     """Shapes are moved by up to so many voxels along every axis."""
-    half_precision: bool = False
+    half_precision: bool = True
     """Networks in bfloat16."""
     seed: int = 0
     """Seed of weights, order, augmentation and noise."""
@@ -60,15 +62,18 @@ class ShapeVaeConfig:
     """Steps between checkpoints."""
 
     def model(self, names: tuple[str, ...]) -> ModelConfig:
-        """The networks: shape networks as configured, and the smallest image encoder, which is not trained."""
+        """The networks: shape networks of `tiny`, and the smallest image encoder, which is not trained."""
+        shapes = tiny() if self.initial is None else load(self.initial).config
         return dataclasses.replace(
             nano(),
             categories=names,
             symmetry=(1,) * len(names),
             latent_dim=self.latent_dim,
-            prior_width=64,
-            voxel_encoder_channels=self.encoder_channels,
-            decoder_channels=self.decoder_channels,
+            prior_width=shapes.prior_width,
+            voxel_size=shapes.voxel_size,
+            voxel_patches=shapes.voxel_patches,
+            voxel_encoder_channels=shapes.voxel_encoder_channels,
+            decoder_channels=shapes.decoder_channels,
         )
 
 
@@ -112,9 +117,11 @@ def fit_shape_vae(
     if not len(archive):
         raise input_error("no shapes to learn")
     model = Nolbo.from_seed(config.model(archive.names), config.seed)
+    if config.initial is not None:
+        adopt_features(model, load(config.initial).model, SHAPE_FEATURES)
     model = model.to(torch.get_default_dtype())
     schedule = OptimizerConfig(config.steps, config.learning_rate, warmup=min(50, config.steps), clip=5000.0, ema=0.99)
-    run = StageRun(model, TrainingStage("shapes", schedule, SHAPE_STAGE), config.half_precision)
+    run = StageRun(model, TrainingStage("shapes", schedule, SHAPE_STAGE, decode=config.decode), config.half_precision)
     identity = {**dataclasses.asdict(config), "shapes": len(archive)}
     identity = {name: list(v) if isinstance(v, tuple) else v for name, v in identity.items() if name != "checkpoint_every"}
     if checkpoint is not None and checkpoint.is_file():

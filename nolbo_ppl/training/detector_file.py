@@ -67,27 +67,27 @@ def adopt(model: Nolbo, initial: Nolbo, detector: str | os.PathLike[str] | None)
         model.guide.get_submodule("detector").load_state_dict(read_detector(detector).state_dict())
 
 
-FEATURES = ("guide.encoder.", "story.decoder.layers.", "shape_guide.encoder.layers.")
+SHAPE_FEATURES = ("story.decoder.layers.", "shape_guide.encoder.layers.")
+"""Convolutions of the shape networks."""
+FEATURES = ("guide.encoder.", *SHAPE_FEATURES)
 """Parts of the networks that features are: what depends neither on the latent nor on the method."""
 
 
-def adopt_features(model: Nolbo, initial: Nolbo) -> None:
+def adopt_features(model: Nolbo, initial: Nolbo, parts: tuple[str, ...] = FEATURES) -> None:
     """Give a model the features of another one; heads, latent and prior networks stay as they are.
+
+    Args:
+        model: the networks to change.
+        initial: where the features come from.
+        parts: which ones, by the beginnings of their names.
 
     Raises:
         InputError: features of another size.
     """
-    own = model.state_dict()
-    taken = {name: value for name, value in initial.state_dict().items() if name.startswith(FEATURES)}
-    wrong = sorted(
-        name
-        for name in {*taken, *(n for n in own if n.startswith(FEATURES))}
-        if name not in own or name not in taken or own[name].shape != taken[name].shape
-    )
+    own, given = model.state_dict(), initial.state_dict()
+    names = [name for name in {**own, **given} if name.startswith(parts)]
+    wrong = sorted(name for name in names if name not in own or name not in given or own[name].shape != given[name].shape)
     if wrong:
-        raise input_error(
-            "features of the initial weights",
-            got=f"{len(wrong)} tensors of other shapes, {wrong[0]}",
-            do="give --preset of theirs",
-        )
-    model.load_state_dict({**own, **taken})
+        got = f"{len(wrong)} tensors of other shapes, {wrong[0]}"
+        raise input_error("features of the initial weights", got=got, do="give --preset of theirs")
+    model.load_state_dict({**own, **{name: given[name] for name in names}})

@@ -68,7 +68,7 @@ class AdversarialLoss(nn.Module):
         self.loss, self.discriminator, self.decoder = loss, model.discriminator, model.story.decoder
         self.weights, self.config = dict(weights), model.config
 
-    def forward(self, batch: SceneBatch | ShapeBatch, **options: int) -> ElboResult:
+    def forward(self, batch: SceneBatch | ShapeBatch, **options: int | None) -> ElboResult:
         """The other loss, less the weighted terms a scene (a shape, in the stage of shapes)."""
         result = self.loss(batch, **options)
         packed, noise, share, scenes = _true_shapes(batch, options.get("decode"))

@@ -42,7 +42,8 @@ class TrainingStage:
     freeze_encoder: bool = False
     """The image encoder stays as it is (normalisation included)."""
     decode: int = 0
-    """Objects decoded a step; their voxel term stands for all objects. 0 where voxels have no weight."""
+    """Objects decoded a step; their voxel term stands for all objects. 0 where voxels have no weight, and for all
+    shapes in the stage of shapes."""
 
 
 class ShapeLoss(nn.Module):
@@ -52,9 +53,9 @@ class ShapeLoss(nn.Module):
         super().__init__()
         self.story, self.guide, self.elbo = model.shape_model, model.shape_guide, elbo
 
-    def forward(self, batch: ShapeBatch) -> ElboResult:
+    def forward(self, batch: ShapeBatch, decode: int | None = None) -> ElboResult:
         """Evaluate the bound, in nats a shape."""
-        return self.elbo.evaluate(self.story, self.guide, batch, scenes=len(batch.voxels))
+        return self.elbo.evaluate(self.story, self.guide, batch, scenes=len(batch.voxels), decode=decode)
 
 
 class StageRun:
@@ -112,7 +113,8 @@ class StageRun:
     def step(self, batch: SceneBatch | ShapeBatch) -> optimisation.StepInfo:
         """One optimiser step."""
         self.set_modes()
-        arguments = {} if self.stage.name == "shapes" else {"decode": self.stage.decode}
+        shapes = self.stage.name == "shapes"
+        arguments = {"decode": (self.stage.decode or None) if shapes else self.stage.decode}
         self.state, info = optimisation.step(self.state, batch, **arguments)
         if self._local and (self.finished or self.state.step % self.average_every == 0):
             optimisation.average_over_processes(self.state)
