@@ -40,6 +40,7 @@ LAYERS = (
     ("viz",),
     ("report",),
     ("pipeline",),
+    ("reproduction",),
     ("cli",),
     ("train", "slam", "__main__"),
 )

@@ -16,7 +16,7 @@ from nolbo_ppl.io.files import read_jsonl
 from nolbo_ppl.models.baselines.method import METHODS, MethodName
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset
-from nolbo_ppl.synthetic.scenes.scene_source import SceneSource
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +31,7 @@ def _single_precision(_float64: None) -> Iterator[None]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Thirty scenes of 64 px, with two shapes of each category."""
     out = tmp_path_factory.mktemp("methods") / "scenes"
-    write_scenes(out, SceneSource(preset("easy", 64), 3, instances=2), 30)
+    write_scenes(out, SceneGenerator(preset("easy", 64), 3, instances=2), 30)
     return out
 
 
