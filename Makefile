@@ -11,7 +11,7 @@ FUZZ_SECONDS ?= 600
 # Kills, signals and full disks of `make faults`.
 FAULTS ?= 100
 
-.PHONY: setup demo train test test-shapes lint wheel bench bench-gate docs clean fuzz faults
+.PHONY: setup demo train test test-shapes lint wheel bench bench-gate docs clean fuzz faults test-lowest test-newest audit
 
 setup: $(STAMP)
 
@@ -48,6 +48,27 @@ wheel: $(STAMP)
 	cd build && bare/bin/nolbo slam --odometry bare/world/odometry.txt --observations bare/world/observations.jsonl \
 		--truth bare/world/truth.txt --out bare/map
 	test -s build/bare/map/summary.json
+	build/bare/bin/python tools/bill_of_materials.py --wheel dist/*.whl --out dist/bill-of-materials.cdx.json
+
+# The lowest versions that pyproject.toml allows, and the newest there are: each in an environment of its own, the part of the
+# tests that goes through every dependency.
+DEPENDENCY_TESTS := tests/geometry tests/io tests/structures tests/inference/slam/test_solve.py tests/models/distributions
+
+test-lowest:
+	$(PYTHON) -m venv build/lowest
+	$(PYTHON) tools/lower_bounds.py > build/lowest.txt
+	build/lowest/bin/python -m pip install --quiet -c build/lowest.txt -e . pytest hypothesis mpmath
+	OMP_NUM_THREADS=1 build/lowest/bin/python -m pytest -q -W default $(DEPENDENCY_TESTS)
+
+test-newest:
+	$(PYTHON) -m venv build/newest
+	build/newest/bin/python -m pip install --quiet --upgrade -e . pytest hypothesis mpmath
+	OMP_NUM_THREADS=1 build/newest/bin/python -m pytest -q $(DEPENDENCY_TESTS)
+
+# Known vulnerabilities of what a user gets (asks the advisory database of the package index).
+audit: wheel
+	$(BIN)/python -m pip install --quiet pip-audit
+	$(BIN)/python -m pip_audit --path build/bare/lib/python3.*/site-packages --skip-editable
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/observation.py --out build/observation.json

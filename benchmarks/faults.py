@@ -87,7 +87,7 @@ def heavy_imports(verbs: set[str]) -> None:
 
     torch.set_num_threads(1)
     more = {
-        "slam": ("viz.map_plots", "inference.slam.incremental.online_slam"),
+        "slam": ("viz.map_plots", "inference.slam.incremental.incremental_slam"),
         "observe": ("viz.posterior_plots",),
         "run": ("viz.map_plots", "report"),
         "train": ("training.trainer",),
