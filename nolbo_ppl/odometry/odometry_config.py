@@ -16,7 +16,7 @@ class StepFlag(IntFlag):
     """What a step lacked; zero is a plain step. Bits are joined."""
 
     OK = 0
-    """Essential matrix and scale were both found."""
+    """The motion and its length were both measured."""
     FEW_MATCHES = 1
     """Too few matches or inliers: the step before is repeated, with a large covariance."""
     STILL = 2
@@ -27,6 +27,8 @@ class StepFlag(IntFlag):
     """No ground was found: the length before is repeated."""
     TWIN = 16
     """All matches lie on one plane, which allows two motions: the likelier one, with a covariance that holds both."""
+    WEAK = 32
+    """Matches so few or so close together that the motion is hardly better known than by a guess; its covariance says so."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,29 @@ class GroundHeight:
             raise input_error("noise of the ground", got=f"{self.ratio}, {self.acceleration}", expected="more than 0")
 
 
-Scale = KnownLengths | GroundHeight
+@dataclass(frozen=True)
+class MeasuredDepth:
+    """Scale from depth images (RGB-D, stereo): each step is measured in metres. Errors are those of one pixel."""
+
+    ratio: float = 0.0015
+    """Standard deviation of a depth that grows with its square, 1/m (structured light: Khoshelham and Elberink 2012)."""
+    floor: float = 0.005
+    """Least standard deviation of a depth, m."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.ratio, self.floor]).all() and self.ratio >= 0 and self.floor > 0):
+            raise input_error("noise of depths", got=f"ratio {self.ratio}, floor {self.floor}", expected="floor above 0")
+
+    def scale(self, depth: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Standard deviation of depths, m.
+
+        >>> MeasuredDepth(ratio=0.001, floor=0.003).scale(np.array([0.0, 2.0])).round(4).tolist()
+        [0.003, 0.005]
+        """
+        return np.hypot(self.ratio * np.asarray(depth) ** 2, self.floor)
+
+
+Scale = KnownLengths | GroundHeight | MeasuredDepth
 
 
 def lengths_of(T_world_camera: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n-1"]:

@@ -3,13 +3,14 @@
 All matches on one plane obey two essential matrices (Longuet-Higgins 1986): the true motion (R, t) before a plane of normal
 n, and its twin, in which translation and normal have changed places. A wall passed sideways and bare ground ahead are such
 scenes; five-point consensus takes either at random. What tells them apart: points must lie before both cameras, the normal
-must stay that of one plane from step to step, and the camera hardly turns more than it has to.
+must stay that of one plane from step to step, and the camera hardly turns more than it has to. One step may not tell; so both
+motions are kept, with what was held against each, and the steps that follow decide (the best sum over the sequence, Viterbi).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -30,6 +31,31 @@ DECIDED = 8.0
 """Surprise, nats, by which a twin must exceed the best motion to be forgotten."""
 MIN_DOUBT = 0.05
 """Least probability that is left to any other twin: with it, the truth is within Mahalanobis^2 of 20 whichever it is."""
+
+
+@dataclass(frozen=True)
+class PlanePast:
+    """What frames up to this one may have seen and how the camera went."""
+
+    normal: Float[np.ndarray, " 3"] | None = None
+    """Normal of the plane in this camera; None where no plane was seen."""
+    direction: Float[np.ndarray, " 3"] | None = None
+    """Direction of the last translation that was measured, in the camera before it."""
+    surprise: float = 0.0
+    """What is held against it, nats more than against the best."""
+
+    def turned(self, R: Float[np.ndarray, "3 3"]) -> PlanePast:
+        """The same in a camera that has turned by `R` = R_earlier_later."""
+        return self if self.normal is None else replace(self, normal=R.T @ self.normal)
+
+    def against(self, R: Float[np.ndarray, "3 3"], normal: Float[np.ndarray, " 3"], direction: Float[np.ndarray, " 3"]) -> float:
+        """What it holds against a step with rotation `R`, a plane with this normal in the later camera, and this direction."""
+        held = self.surprise
+        if self.normal is not None:
+            held += bounded(angle_between(R @ normal, self.normal), NORMAL_SCALE)
+        if self.direction is not None:
+            held += bounded(angle_between(direction, self.direction), 1.5 * NORMAL_SCALE)
+        return held
 
 
 @dataclass(frozen=True)
@@ -81,8 +107,7 @@ def plane_motions(
     intrinsics: Float[np.ndarray, " 4"],
     config: OdometryConfig,
     also: TwoView | None = None,
-    normal: Float[np.ndarray, " 3"] | None = None,
-    direction: Float[np.ndarray, " 3"] | None = None,
+    past: Sequence[PlanePast] = (),
 ) -> list[PlaneMotion]:
     """The motions of a homography with (nearly) all points before both cameras, the least surprising first.
 
@@ -93,8 +118,7 @@ def plane_motions(
         second: the same of the later image.
         intrinsics: fx, fy, cx, cy, px.
         config: settings.
-        normal: normal of the plane of the step before, in the earlier camera.
-        direction: direction of the step before.
+        past: what the earlier camera may have seen before.
     """
     fx, fy, cx, cy = intrinsics
     camera = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -120,12 +144,19 @@ def plane_motions(
         n = np.linalg.lstsq(ray_second[view.inliers], rho[:, 1], rcond=None)[0]  # 1 / z = n . ray / distance on the plane
         n /= max(float(np.linalg.norm(n)), 1e-12)
         surprise = 2.0 * len(first) * view.cost + bounded(float(rotation_angle(view.R)), TURN_SCALE)
-        if normal is not None:
-            surprise += bounded(angle_between(view.R @ n, normal), NORMAL_SCALE)
-        if direction is not None:
-            surprise += bounded(angle_between(view.direction, direction), 1.5 * NORMAL_SCALE)
+        surprise += min((before.against(view.R, n, view.direction) for before in past), default=0.0)
         found.append(PlaneMotion(view, n, surprise, beginning))
     return sorted(found, key=lambda motion: motion.surprise)
+
+
+def pasts_of(motions: Sequence[PlaneMotion]) -> tuple[PlanePast, ...]:
+    """What the next step has to know of the motions of this one: all that are not ruled out for good."""
+    least = motions[0].surprise
+    return tuple(
+        PlanePast(motion.normal, motion.view.direction, min(motion.surprise - least, 2.0 * BOUND))
+        for motion in motions
+        if motion.surprise - least < 3.0 * BOUND
+    )
 
 
 def twin_covariance(motions: Sequence[PlaneMotion], length: float) -> Float[np.ndarray, "6 6"] | None:

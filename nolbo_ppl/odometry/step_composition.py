@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import adjoint, inverse, relative, rotation_angle
-from nolbo_ppl.odometry.visual_odometry import Odometry
+from nolbo_ppl.odometry.odometry_state import Odometry
 
 
 def compose_covariance(

@@ -7,8 +7,9 @@ import pytest
 
 from nolbo_ppl.geometry.pose import inverse, make_pose, rotation_angle, se3_log, so3_exp
 from nolbo_ppl.odometry.odometry_config import KnownLengths, OdometryConfig, StepFlag
-from nolbo_ppl.odometry.planar_scene import angle_between, plane_inliers, plane_motions
-from nolbo_ppl.odometry.visual_odometry import OdometryState, VisualOdometry, motion
+from nolbo_ppl.odometry.odometry_state import OdometryState, VisualOdometry
+from nolbo_ppl.odometry.planar_scene import PlanePast, angle_between, plane_inliers, plane_motions
+from nolbo_ppl.odometry.step_estimation import motion
 
 INTRINSICS = np.array([200.0, 200.0, 192.0, 96.0])
 NOISE = 0.4
@@ -65,8 +66,10 @@ def test_the_normal_of_the_plane_decides_between_twins() -> None:
         plane = plane_inliers(first, second, OdometryConfig())
         assert plane is not None
         true = np.array([0.5, 0, 0.866])
-        motions = plane_motions(plane[0], first, second, INTRINSICS, OdometryConfig(), normal=true)
-        other = plane_motions(plane[0], first, second, INTRINSICS, OdometryConfig(), normal=unit(T[:3, 3]))
+        motions, other = (
+            plane_motions(plane[0], first, second, INTRINSICS, OdometryConfig(), past=[PlanePast(normal)])
+            for normal in (true, unit(T[:3, 3]))
+        )
         errors = [angle_between(found[0].view.direction, unit(T[:3, 3])) for found in (motions, other)]
         right += errors[0] <= errors[1]
     assert right >= 18  # by chance 10; the two lie within a few degrees of each other in the rest

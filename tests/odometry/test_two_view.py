@@ -209,7 +209,7 @@ def test_standing_still_is_flagged() -> None:
     assert step.flags == StepFlag.STILL
     np.testing.assert_allclose(step.T_earlier_later, np.eye(4), atol=1e-3)
     ground = measured(first, second, GroundHeight(CAMERA_HEIGHT), length=LengthBelief(0.7, 0.03))
-    assert np.linalg.norm(ground.T_earlier_later[:3, 3]) == 0 and ground.covariance[3, 3] == pytest.approx(0.35**2, rel=1e-3)
+    assert np.linalg.norm(ground.T_earlier_later[:3, 3]) == 0 and np.sqrt(ground.covariance[3, 3]) < 0.05
 
 
 def test_too_few_matches_repeat_the_step_before() -> None:
