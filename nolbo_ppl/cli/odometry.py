@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json_object, write_json
 from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.output_folder import output_folder
+from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, read_frame_poses, write_trajectory
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, path_length
 from nolbo_ppl.odometry import (
@@ -34,6 +36,7 @@ from nolbo_ppl.odometry import (
     estimate_odometry,
     lengths_of,
 )
+from nolbo_ppl.pipeline.perception import DepthSource, depth_noise, open_depth
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,9 @@ class OdometryRunConfig:
     intrinsics: Path | None = None
     """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, intrinsics.json, a KITTI calib.txt, or a text file with fx fy cx cy
     and the distortion, which is taken out of the images. Without a file the camera is guessed."""
-    scale: Literal["truth", "ground", "file"] = "ground"
-    """Length of the steps: of the true trajectory, from the ground under the camera, or of a file (a wheel)."""
+    scale: Literal["truth", "ground", "file", "depth"] = "ground"
+    """Length of the steps: of the true trajectory, from the ground under the camera, of a file (a wheel), or measured by depth
+    images (of `--depth`, which implies it, or of a TUM RGB-D folder)."""
     truth: Path | None = None
     """True trajectory, a row a frame (or TUM rows matched by time): for `--scale truth`, and for errors."""
     lengths: Path | None = None
@@ -59,6 +63,10 @@ class OdometryRunConfig:
     """Height of the camera over the ground in metres, for `--scale ground`."""
     camera_pitch: float = 0.0
     """How far the camera looks down, rad, for `--scale ground`."""
+    depth: Path | None = None
+    """Folder of depth pictures (16 bit PNG, same names or same order as the images), registered to the images, or `BAG:/topic`."""
+    depth_unit: float = 1 / 5000
+    """Metres of one step of them: TUM 1/5000, YCB-Video 1/10000, millimetres 1/1000."""
     first: int = 0
     """First frame."""
     count: int | None = None
@@ -126,7 +134,20 @@ def known_lengths(path: Path, part: Part) -> np.ndarray:
     )
 
 
-def scale_of(arguments: OdometryRunConfig, part: Part, truth: np.ndarray | None) -> Scale:
+def depth_source(arguments: OdometryRunConfig, part: Part) -> DepthSource | None:
+    """Depth of the part's frames where it gives the lengths. Raises `InputError` where there is none or it does not fit."""
+    implied = arguments.depth is not None and arguments.camera_height is None and arguments.scale == "ground"
+    if arguments.scale != "depth" and not implied:
+        return None
+    if not (np.isfinite(arguments.depth_unit) and arguments.depth_unit > 0):
+        raise input_error("--depth-unit", got=arguments.depth_unit, expected="metres of one step, above 0")
+    if arguments.depth is None and not part.frames.has_depth:
+        raise input_error("--scale depth without depth images", do="give --depth FOLDER, or a TUM folder with depth.txt")
+    index = list(range(part.first, part.first + len(part)))
+    return open_depth(part.frames, index, arguments.depth, arguments.depth_unit)
+
+
+def scale_of(arguments: OdometryRunConfig, part: Part, truth: np.ndarray | None, source: DepthSource | None = None) -> Scale:
     """Where lengths come from. Raises `InputError` when the option that gives them is missing."""
     if arguments.scale == "truth":
         if truth is None:
@@ -138,9 +159,15 @@ def scale_of(arguments: OdometryRunConfig, part: Part, truth: np.ndarray | None)
         if arguments.lengths is None:
             raise input_error("--scale file without lengths", do="give --lengths FILE, one length a line")
         return KnownLengths(known_lengths(arguments.lengths, part))
+    if source is not None:
+        return depth_noise(source)
     if arguments.camera_height is None:
         raise input_error("--scale ground without the height of the camera", do="give --camera-height METRES")
     return GroundHeight(arguments.camera_height, arguments.camera_pitch)
+
+
+def _depth(source: DepthSource, part: Part, k: int) -> np.ndarray | None:
+    return source.depth(k, part.frame(k))
 
 
 def summary(odometry: Odometry, truth: np.ndarray | None, seconds: float) -> dict[str, Any]:
@@ -188,19 +215,22 @@ def run(arguments: OdometryRunConfig) -> tuple[Odometry, dict[str, Any]]:
     Raises:
         InputError: unusable input, or an output folder that holds something else; an older result stays as it was.
     """
-    inputs = (arguments.intrinsics, arguments.truth, arguments.lengths)
+    inputs = (arguments.intrinsics, arguments.truth, arguments.lengths, arguments.depth)
     with output_folder(arguments.out, RESULT, is_own=is_result, inputs=inputs) as folder:
         return _estimate(arguments, folder)
 
 
 def _estimate(arguments: OdometryRunConfig, folder: Path) -> tuple[Odometry, dict[str, Any]]:
-    frames, camera, remark = frames_with_camera(open_frames(arguments.images, arguments.topic), arguments.intrinsics)
+    bag = arguments.depth if arguments.depth is not None and is_bag(arguments.depth) else None
+    frames, camera, remark = frames_with_camera(open_frames(arguments.images, arguments.topic, bag), arguments.intrinsics)
     remarks = [remark] if remark else []
     part, intrinsics = part_of(frames, arguments.first, arguments.count), camera.vector
     truth = None if arguments.truth is None else true_poses(arguments.truth, part)
-    scale = scale_of(arguments, part, truth)
+    source = depth_source(arguments, part)
+    scale = scale_of(arguments, part, truth, source)
+    depth = None if source is None else partial(_depth, source, part)
     begin = time.perf_counter()
-    odometry = estimate_odometry(part, intrinsics, scale, arguments.config, progress=True)
+    odometry = estimate_odometry(part, intrinsics, scale, arguments.config, progress=True, depth=depth)
     figures = summary(odometry, truth, time.perf_counter() - begin)
     options = {
         name: str(value) if isinstance(value, Path) else value for name, value in asdict(arguments).items() if name != "config"

@@ -165,3 +165,40 @@ def undistort_image(
     new = intrinsics if target is None else target
     maps = _maps(tuple(intrinsics.tolist()), tuple(new.tolist()), size, model, tuple(coefficients))
     return cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR)
+
+
+def undistort_depth(
+    depth: Float[np.ndarray, "h w"],
+    intrinsics: Float[np.ndarray, " 4"],
+    model: DistortionModel,
+    coefficients: tuple[float, ...],
+    target: Float[np.ndarray, " 4"] | None = None,
+    size: tuple[int, int] | None = None,
+) -> Float[np.ndarray, "h w"]:
+    """The depth image of a pinhole camera, each pixel from the nearest one of the lens; 0 where the lens saw nothing.
+
+    Depth runs along the optical axis, so a lens moves pixels and leaves their values; a value between two sides of an edge
+    would be neither's, so nothing is interpolated.
+
+    Args:
+        depth: depth image of the lens, registered to its colour image, m.
+        intrinsics: fx, fy, cx, cy of the colour image, px.
+        model: distortion model of the lens.
+        coefficients: its coefficients.
+        target: intrinsics of the pinhole camera; those of the lens by default.
+        size: width and height of the colour image where the depth image has another size.
+
+    Example:
+        >>> camera = np.array([200.0, 200.0, 160.0, 120.0])
+        >>> wall = undistort_depth(np.full((240, 320), 2.0), camera, "radial-tangential", (-0.1, 0.0, 0.0, 0.0))
+        >>> float(wall[120, 160])
+        2.0
+    """
+    import cv2
+
+    own = (depth.shape[1], depth.shape[0])
+    zoom = np.ones(4) if size is None else np.tile([own[0] / size[0], own[1] / size[1]], 2)
+    new = intrinsics if target is None else target
+    maps = _maps(tuple((intrinsics * zoom).tolist()), tuple((new * zoom).tolist()), own, model, tuple(coefficients))
+    values = np.nan_to_num(np.asarray(depth, dtype=np.float32), nan=0.0)
+    return cv2.remap(values, maps[0], maps[1], cv2.INTER_NEAREST).astype(np.float64)

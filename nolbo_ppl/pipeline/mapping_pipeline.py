@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nolbo_ppl._moved import renamed
-from nolbo_ppl.data.sequences import open_frames
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
@@ -21,23 +20,14 @@ from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_incremental
 from nolbo_ppl.inference.slam.map_files import library_versions, write_result
 from nolbo_ppl.io.files import read_json
-from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.io.trajectories import Trajectory
-from nolbo_ppl.pipeline.depth_refinement import DepthScale
 from nolbo_ppl.pipeline.map_mesh import build_scene, write_glb
 from nolbo_ppl.pipeline.noise_file import write_noise
-from nolbo_ppl.pipeline.perception import (
-    DepthImages,
-    DepthSource,
-    SequenceDepth,
-    StereoPairs,
-    beside,
-    observe_sequence,
-)
+from nolbo_ppl.pipeline.perception import DepthSource, observe_sequence
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_inputs import RunInputs, estimate_or_read, keyframe_rows, open_run_inputs
+from nolbo_ppl.pipeline.run_inputs import RunInputs, depth_of_drive, estimate_or_read, keyframe_rows, open_run_inputs
 from nolbo_ppl.pipeline.run_summary import summarise
 from nolbo_ppl.pipeline.stage_keys import STAGES, StageName, json_of, stage_settings
 from nolbo_ppl.pipeline.stage_store import PipelineStage, run_stages
@@ -107,13 +97,7 @@ class ObjectMappingPipeline:
 
     def depth_source(self) -> DepthSource:
         """Depth of the keyframes, where there is any."""
-        config, index = self.config, self.run.keyframes.tolist()
-        if config.depth is not None and not is_bag(config.depth):
-            return DepthImages(beside(config.depth, self.run.image_names, index), DepthScale(config.depth_unit))
-        if config.right is not None and config.baseline is not None:
-            right = open_frames(config.right)
-            return StereoPairs(lambda k: right.frame(index[k]), float(self.drive.intrinsics[0]), config.baseline)
-        return SequenceDepth(self.drive.frames, index)
+        return depth_of_drive(self.drive, self.config, self.run.keyframes.tolist())
 
     def observe(self) -> None:
         """The guide on every keyframe."""

@@ -9,8 +9,10 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nolbo_ppl.data.sequences import FrameSequence
+from nolbo_ppl.data.sequences import FrameSequence, UndistortedFrames, open_frames
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.ros_bags import is_bag
+from nolbo_ppl.odometry import MeasuredDepth
 from nolbo_ppl.pipeline.depth_refinement import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.structures.detections import Detections
@@ -39,15 +41,22 @@ class DepthImages:
     Args:
         paths: one a keyframe, None where there is none.
         scale: what their numbers mean.
+        lens: frames whose distortion is taken out of the pictures as well.
     """
 
-    def __init__(self, paths: Sequence[Path | None], scale: DepthScale) -> None:
-        self.paths, self.scale = tuple(paths), scale
+    def __init__(self, paths: Sequence[Path | None], scale: DepthScale, lens: UndistortedFrames | None = None) -> None:
+        self.paths, self.scale, self.lens = tuple(paths), scale, lens
 
     def depth(self, k: int, image: Picture) -> Float[np.ndarray, "h w"] | None:
         """Depth of a keyframe."""
         path = self.paths[k]
-        return None if path is None else read_depth(path, self.scale)
+        if path is None:
+            return None
+        found = read_depth(path, self.scale)
+        if self.lens is None:
+            return found
+        pinhole = self.lens.depth_of_lens(found)
+        return np.where(pinhole > 0, pinhole, np.nan)
 
 
 class StereoPairs:
@@ -83,6 +92,45 @@ class SequenceDepth:
         """Depth of a keyframe."""
         known = self.frames.depth(self.index[k])
         return None if known is None else np.where(known > 0, known, np.nan)
+
+
+def open_depth(
+    frames: FrameSequence,
+    index: Sequence[int],
+    folder: Path | None = None,
+    unit: float = DepthScale().unit,
+    right: Path | None = None,
+    baseline: float | None = None,
+    focal: float = 1.0,
+) -> DepthSource:
+    """Depth of some frames: from a folder of pictures, a second camera, or what the sequence itself brings.
+
+    Args:
+        frames: the sequence.
+        index: which of its frames, in the order they are asked for.
+        folder: depth pictures, or `BAG:/topic`.
+        unit: metres of one step of them.
+        right: images of the right camera of a rectified pair.
+        baseline: distance of the two cameras, m.
+        focal: focal length of the pair, px.
+
+    Raises:
+        InputError: pictures that belong to no frame.
+    """
+    if folder is not None and not is_bag(folder):  # frames of a bag bring its depth themselves
+        lens = frames if isinstance(frames, UndistortedFrames) else None
+        return DepthImages(beside(folder, [frames.name(k) for k in index], index), DepthScale(unit), lens)
+    if right is not None and baseline is not None:
+        other = open_frames(right)
+        return StereoPairs(lambda k: other.frame(index[k]), focal, baseline)
+    return SequenceDepth(frames, index)
+
+
+def depth_noise(source: DepthSource) -> MeasuredDepth:
+    """Noise of the depths for visual odometry, whose steps rest on single pixels; its residuals correct it."""
+    if isinstance(source, StereoPairs):
+        return MeasuredDepth(ratio=source.scale.ratio)
+    return MeasuredDepth(ratio=STRUCTURED_LIGHT)
 
 
 def beside(folder: Path, images: Sequence[str], index: Sequence[int]) -> list[Path | None]:

@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.odometry import OdometryConfig
@@ -68,13 +70,14 @@ class RunConfig:
     object would be two landmarks; of two objects so close in one image another image shows the second."""
     batch: int = field(default=16, metadata=affects(None))
     """Images that go through the network at once."""
-    depth: Path | None = field(default=None, metadata=affects("observe", "folder"))
-    """Folder of depth pictures (16 bit PNG, same names or same order as the images), or `BAG:/topic`: refine positions."""
-    depth_unit: float = field(default=1 / 5000, metadata=affects("observe"))
+    depth: Path | None = field(default=None, metadata=affects("odometry", "folder"))
+    """Folder of depth pictures (16 bit PNG, same names or same order as the images), registered to them, or `BAG:/topic`: refine positions,
+    and give visual odometry metric steps where neither height nor wheel does. A lens' distortion is taken out of them as well."""
+    depth_unit: float = field(default=1 / 5000, metadata=affects("odometry"))
     """Metres of one step of them: TUM 1/5000, YCB-Video 1/10000, millimetres 1/1000."""
-    right: Path | None = field(default=None, metadata=affects("observe", "folder"))
-    """Folder of the right images of a rectified stereo pair: refine positions."""
-    baseline: float | None = field(default=None, metadata=affects("observe"))
+    right: Path | None = field(default=None, metadata=affects("odometry", "folder"))
+    """Folder of the right images of a rectified stereo pair: refine positions, and give visual odometry metric steps."""
+    baseline: float | None = field(default=None, metadata=affects("odometry"))
     """Distance of the two cameras, m."""
     mcap: bool = field(default=False, metadata=affects("map"))
     """Also write trajectory and map as map.mcap, for Foxglove and rviz (extra `ros`)."""
@@ -110,5 +113,7 @@ class RunConfig:
             raise input_error("a stereo pair", got="--right or --baseline alone", expected="both")
         if self.baseline is not None and not self.baseline > 0:
             raise input_error("--baseline", got=self.baseline, expected="a distance in m")
+        if not (np.isfinite(self.depth_unit) and self.depth_unit > 0):
+            raise input_error("--depth-unit", got=self.depth_unit, expected="metres of one step, above 0")
         if self.camera_height is not None and self.wheel is not None:
             raise input_error("--camera-height and --wheel", got="both", expected="one source of lengths")

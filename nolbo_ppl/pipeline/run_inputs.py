@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +28,7 @@ from nolbo_ppl.io.trajectories import covariance_beside, poses_of_frames, read_f
 from nolbo_ppl.odometry import (
     GroundHeight,
     KnownLengths,
+    MeasuredDepth,
     Odometry,
     Scale,
     at_keyframes,
@@ -33,6 +36,7 @@ from nolbo_ppl.odometry import (
     keyframes,
     lengths_of,
 )
+from nolbo_ppl.pipeline.perception import DepthSource, depth_noise, open_depth
 from nolbo_ppl.pipeline.run_config import RunConfig
 
 Poses = Float[np.ndarray, "n 4 4"]
@@ -120,8 +124,8 @@ def open_run_inputs(config: RunConfig) -> RunInputs:
     frames = open_frames(config.images, config.topic, depth)
     frames, camera, remark = frames_with_camera(frames, config.intrinsics)
     remarks = [remark] if remark else []
-    if isinstance(frames, UndistortedFrames) and (config.depth is not None or config.right is not None):
-        raise input_error("--depth or --right with a distorted camera", expected="images that were rectified together")
+    if isinstance(frames, UndistortedFrames) and config.right is not None:
+        raise input_error("--right with a distorted camera", expected="images that were rectified together")
     truth = None
     if config.truth is not None:
         found = read_frame_poses(config.truth, len(frames), frames.times, interpolate=is_bag(config.truth), of="the images")
@@ -130,8 +134,14 @@ def open_run_inputs(config: RunConfig) -> RunInputs:
     return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth, tuple(remarks))
 
 
+def depth_of_drive(drive: RunInputs, config: RunConfig, index: Sequence[int]) -> DepthSource:
+    """Depth of some images, where there is any. Raises `InputError` for pictures that belong to no image."""
+    focal = float(drive.intrinsics[0])
+    return open_depth(drive.frames, index, config.depth, config.depth_unit, config.right, config.baseline, focal)
+
+
 def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
-    """Where visual odometry has its lengths from: a wheel, the height over the ground, or the truth.
+    """Where visual odometry has its lengths from: a wheel, the height over the ground, depth images, or the truth.
 
     Raises:
         InputError: nowhere, or a wheel file that does not fit.
@@ -140,13 +150,15 @@ def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
         return GroundHeight(config.camera_height, pitch=config.camera_pitch)
     if config.wheel is not None:
         return KnownLengths(lengths_between(read_step_lengths(config.wheel, len(drive.frames) - 1), drive.used))
+    if config.depth is not None or config.right is not None or drive.frames.has_depth:
+        return depth_noise(depth_of_drive(drive, config, drive.used.tolist()))
     if drive.truth is not None:
         if not np.isfinite(drive.truth[drive.used]).all():
             raise input_error("lengths from a truth with gaps", expected="a pose for every image, --wheel or --camera-height")
         return KnownLengths(lengths_of(drive.truth[drive.used]))
     raise input_error(
         "visual odometry without a scale",
-        expected="--camera-height, --wheel or --truth",
+        expected="--camera-height, --wheel, --depth, --right or --truth",
         do="or give an odometry of your own with --odometry",
     )
 
@@ -165,6 +177,10 @@ def lengths_between(lengths: Float[np.ndarray, " n"], used: Int[np.ndarray, " u"
     return np.diff(along[used])
 
 
+def _depth(source: DepthSource, frames: FrameSubset, k: int) -> Float[np.ndarray, "h w"] | None:
+    return source.depth(k, frames.frame(k))
+
+
 def estimate_or_read(drive: RunInputs, config: RunConfig) -> FoundOdometry:
     """The given odometry, with the covariances beside it where there are any, or visual odometry.
 
@@ -172,9 +188,12 @@ def estimate_or_read(drive: RunInputs, config: RunConfig) -> FoundOdometry:
         InputError: an odometry that does not match the images, or none and no scale to make one.
     """
     if config.odometry is None:
-        found = estimate_odometry(
-            FrameSubset(drive.frames, drive.used), drive.intrinsics, scale_of(drive, config), config.visual, progress=True
-        )
+        scale, frames = scale_of(drive, config), FrameSubset(drive.frames, drive.used)
+        depth = None
+        if isinstance(scale, MeasuredDepth):
+            source = depth_of_drive(drive, config, drive.used.tolist())
+            depth = partial(_depth, source, frames)
+        found = estimate_odometry(frames, drive.intrinsics, scale, config.visual, progress=True, depth=depth)
         return FoundOdometry(found, stated=True)
     frames = drive.frames
     poses = poses_of_frames(

@@ -79,6 +79,11 @@ class BagFrames(FrameSequence):
         self.check(k)
         return f"{self.topic.strip('/').replace('/', '_')}#{k:06d}"
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether some frames bring depth images."""
+        return bool(self._depth_of)
+
     def depth(self, k: int, /) -> Float[np.ndarray, "h w"] | None:
         """Depth of frame k, m, 0 where unknown; None where no depth image was taken within 20 ms."""
         self.check(k)

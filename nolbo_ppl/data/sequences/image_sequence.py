@@ -67,6 +67,11 @@ class FrameSequence(ABC):
         stamps = [self.time(k) for k in range(len(self))]
         return None if any(stamp is None for stamp in stamps) else np.array(stamps, dtype=np.float64)
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether frames bring depth images."""
+        return False
+
     def depth(self, k: int, /) -> Float[np.ndarray, "h w"] | None:
         """Depth of frame k in m, 0 where unknown; None where there is no depth image."""
         self.check(k)
@@ -186,6 +191,11 @@ class TumFolder(ImageFolder):
             _, depth_times, depth_files = read_listing(path / "depth.txt")
             rows, partners = match_times(times, depth_times, DEPTH_TOLERANCE)
             self.depth_files = {int(row): depth_files[int(partner)] for row, partner in zip(rows, partners)}
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether some frames bring depth images."""
+        return bool(self.depth_files)
 
     def depth(self, k: int, /) -> Float[np.ndarray, "h w"] | None:
         """Depth of frame k in m, 0 where unknown; None where no depth image was taken within 20 ms."""

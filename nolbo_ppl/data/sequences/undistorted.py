@@ -10,8 +10,7 @@ from jaxtyping import Float, UInt8
 
 from nolbo_ppl.data.sequences.bag_frames import BagFrames
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder
-from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.distortion import undistort_image
+from nolbo_ppl.geometry.distortion import undistort_depth, undistort_image
 from nolbo_ppl.io.camera_files import CameraIntrinsics, camera_of_images, read_camera
 from nolbo_ppl.io.images import exif_focal_length
 
@@ -51,11 +50,22 @@ class UndistortedFrames(FrameSequence):
         """Width and height of the frames, px."""
         return self.source.size
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether frames bring depth images."""
+        return self.source.has_depth
+
     def depth(self, k: int, /) -> Float[np.ndarray, "h w"] | None:
-        """None where there is no depth image. Raises `InputError` where there is one: it fits the distorted frame."""
-        if self.source.depth(k) is not None:
-            raise input_error("depth of a camera with distortion", expected="depth and images that were undistorted together")
-        return None
+        """Depth of frame k in m, without the distortion of the lens, 0 where unknown; None where there is no depth image."""
+        found = self.source.depth(k)
+        return None if found is None else self.depth_of_lens(found)
+
+    def depth_of_lens(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        """A depth image that is registered to a frame as the lens took it, without the distortion; 0 where unknown."""
+        if self.camera.model is None:
+            return depth
+        camera = self.camera
+        return undistort_depth(depth, camera.vector, camera.model, camera.distortion, self.pinhole.vector, self.size)
 
 
 def without_distortion(frames: FrameSequence, camera: CameraIntrinsics) -> tuple[FrameSequence, CameraIntrinsics]:
