@@ -64,7 +64,7 @@ class OdometryRunConfig:
     camera_pitch: float = 0.0
     """How far the camera looks down, rad, for `--scale ground`."""
     depth: Path | None = None
-    """Folder of depth pictures (16 bit PNG, same names or same order as the images), registered to the images, or `BAG:/topic`."""
+    """Folder of depth pictures (16 bit PNG, same names or same order as the images), registered to them, or `BAG:/topic`."""
     depth_unit: float = 1 / 5000
     """Metres of one step of them: TUM 1/5000, YCB-Video 1/10000, millimetres 1/1000."""
     first: int = 0

@@ -146,7 +146,9 @@ def _maps(
 ) -> tuple[np.ndarray, np.ndarray]:
     import cv2
 
-    K, new, d = _camera(np.array(intrinsics)), _camera(np.array(target)), np.array(coefficients)
+    # OpenCV has the first pixel's centre at (0, 0), a camera here at (0.5, 0.5).
+    K, new = (_camera(np.array(vector) - [0, 0, 0.5, 0.5]) for vector in (intrinsics, target))
+    d = np.array(coefficients)
     make = cv2.fisheye.initUndistortRectifyMap if model == "fisheye" else cv2.initUndistortRectifyMap
     return make(K, d, np.eye(3), new, size, cv2.CV_32FC1)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.alignment import align, principal_plane
@@ -152,10 +152,25 @@ class RunFolder:
         """Covariance of every step of the odometry, [rotation rad, translation m]."""
         return covariance_beside(self.elsewhere.get("odometry.txt", self.path / "odometry.txt"))
 
-    def write_odometry(self, T_world_camera: Poses, covariance: Float[np.ndarray, "n-1 6 6"] | None = None) -> None:
-        """Write `odometry.txt` and, where it is known, `odometry_covariance.npz`."""
+    @cached_property
+    def odometry_flags(self) -> UInt8[np.ndarray, " n-1"] | None:
+        """`StepFlag` bits of the steps of visual odometry; None where the odometry was given."""
+        path = self.path / "odometry_covariance.npz"
+        if "odometry.txt" in self.elsewhere or not path.is_file():
+            return None
+        with Npz(path) as archive:
+            return archive.array("flags", (None,)) if "flags" in archive.names else None
+
+    def write_odometry(
+        self,
+        T_world_camera: Poses,
+        covariance: Float[np.ndarray, "n-1 6 6"] | None = None,
+        flags: UInt8[np.ndarray, " n-1"] | None = None,
+    ) -> None:
+        """Write `odometry.txt` and, where it is known, `odometry_covariance.npz` with what its steps lacked (`StepFlag` bits)."""
         if covariance is not None:
-            save_npz(self.path / "odometry_covariance.npz", {"covariance": covariance})
+            arrays = {"covariance": covariance} | ({} if flags is None else {"flags": flags})
+            save_npz(self.path / "odometry_covariance.npz", arrays)
         write_trajectory(self.path / "odometry.txt", Trajectory(T_world_camera))
         self.__dict__.pop("odometry", None)  # a file holds fewer digits: what is read is what a second run reads
 

@@ -14,16 +14,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nolbo_ppl.geometry.pose import inverse, make_pose, se3_exp, skew, transform
-from nolbo_ppl.odometry.epipolar import FREEDOM, GATE, LEAST_SCALE, MAD, rays
+from nolbo_ppl.odometry.epipolar import FREEDOM, GATE, MAD, MIN_SCALE, rays
 from nolbo_ppl.odometry.odometry_config import MeasuredDepth, OdometryConfig
 
 CORNER_SCALE = 0.5
 """Standard deviation of a corner at first, px; the residuals tell it then."""
 EDGE_STEP = 0.1
 """A corner whose neighbours' inverse depths differ from a plane's by this share lies on an edge: nobody knows on which side."""
-LEAST_DEPTHS = 5
+MIN_DEPTHS = 5
 """Of the nine pixels about a corner, so many must have a depth."""
-LEAST_DEPTH = 0.05
+MIN_DEPTH = 0.05
 """Points nearer than this to a camera are none, m."""
 CLEAR = 0.6
 """A motion that more of the matches obey needs no other start."""
@@ -65,10 +65,10 @@ def depth_at(depth: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"], 
     u, v = nearest[:, :1] + across.ravel(), nearest[:, 1:] + up.ravel()
     known = inside[:, None] & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     values = depth[v.clip(0, height - 1), u.clip(0, width - 1)]
-    known &= np.isfinite(values) & (values > LEAST_DEPTH)
+    known &= np.isfinite(values) & (values > MIN_DEPTH)
     rho = np.where(known, 1.0 / np.where(known, values, 1.0), np.nan)
     count = known.sum(axis=1)
-    use = (count >= LEAST_DEPTHS) & known[:, 4]
+    use = (count >= MIN_DEPTHS) & known[:, 4]
     found = np.full(len(place), np.nan)
     if not use.any():
         return found
@@ -114,7 +114,7 @@ def residuals(
     fx, fy = intrinsics[:2]
     ray = rays(matches.first, intrinsics)
     later = transform(inverse(T_earlier_later), ray * matches.depth_first[:, None])
-    before = later[:, 2] > LEAST_DEPTH
+    before = later[:, 2] > MIN_DEPTH
     X, Y, Z = np.where(before[:, None], later, [0.0, 0.0, 1.0]).T
     seen = np.isfinite(matches.depth_second)
     rho = 1.0 / np.where(seen, matches.depth_second, 1.0)
@@ -150,7 +150,7 @@ def residuals(
 def scales_of(residual: Float[np.ndarray, "k 3"], seen: Bool[np.ndarray, " k"]) -> Float[np.ndarray, " 3"]:
     """Robust scales of the whitened residuals: one of both corners, one of the depth."""
     corner = MAD * float(np.median(np.abs(residual[:, :2])))
-    least = LEAST_SCALE / CORNER_SCALE
+    least = MIN_SCALE / CORNER_SCALE
     depth = MAD * float(np.median(np.abs(residual[seen, 2]))) if seen.sum() > 2 else 1.0
     return np.maximum(np.array([corner, corner, depth]), least)
 

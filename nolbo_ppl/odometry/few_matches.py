@@ -27,7 +27,7 @@ DRAWS = 12
 """How often the matches are drawn anew, with replacement (Efron 1979)."""
 DECIDED = 10.0
 """Surprise, nats, by which another motion must exceed the best one to be forgotten."""
-LEAST_DOUBT = 0.06
+MIN_DOUBT = 0.06
 """Least probability left to any other motion that fits: with it the truth is within Mahalanobis^2 of 17 whichever it is."""
 TURN_SCALE, MOST_HELD = 0.3, 6.0
 """How far the direction turns from step to step, rad, and the most that is held against a motion that turns more, nats."""
@@ -160,6 +160,6 @@ def closer_look(
     for motion, surprise in motions[1:]:
         known = [best, *(other for other, _ in rivals)]
         if surprise < DECIDED and min(float(np.linalg.norm(between(other, motion, 1.0))) for other in known) > SAME:
-            rivals.append((motion, max(LEAST_DOUBT, 1.0 / (1.0 + float(np.exp(surprise))))))
+            rivals.append((motion, max(MIN_DOUBT, 1.0 / (1.0 + float(np.exp(surprise))))))
     starts = [best, *(motion for motion, _ in rivals[:2])]
     return CloserLook(best, tuple(rivals), tuple(drawn_anew(starts, first, second, intrinsics, config)))

@@ -71,8 +71,9 @@ class RunConfig:
     batch: int = field(default=16, metadata=affects(None))
     """Images that go through the network at once."""
     depth: Path | None = field(default=None, metadata=affects("odometry", "folder"))
-    """Folder of depth pictures (16 bit PNG, same names or same order as the images), registered to them, or `BAG:/topic`: refine positions,
-    and give visual odometry metric steps where neither height nor wheel does. A lens' distortion is taken out of them as well."""
+    """Folder of depth pictures (16 bit PNG, same names or same order as the images), registered to them, or `BAG:/topic`: refine
+    positions, and give visual odometry metric steps where neither height nor wheel does. A lens' distortion is taken out of
+    them as well."""
     depth_unit: float = field(default=1 / 5000, metadata=affects("odometry"))
     """Metres of one step of them: TUM 1/5000, YCB-Video 1/10000, millimetres 1/1000."""
     right: Path | None = field(default=None, metadata=affects("odometry", "folder"))

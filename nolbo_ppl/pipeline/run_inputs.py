@@ -107,11 +107,15 @@ class FoundOdometry:
     """Poses and, where they are known, covariances."""
     stated: bool
     """Whether covariances are known."""
+    estimated: bool = False
+    """Whether it is visual odometry, whose steps have flags."""
 
-    def at(self, rows: Int[np.ndarray, " k"]) -> tuple[Poses, Float[np.ndarray, "k-1 6 6"] | None]:
-        """Poses at these rows and the covariances of the motions between them."""
+    def at(
+        self, rows: Int[np.ndarray, " k"]
+    ) -> tuple[Poses, Float[np.ndarray, "k-1 6 6"] | None, UInt8[np.ndarray, " k-1"] | None]:
+        """Poses at these rows, the covariances of the motions between them, and what those lacked."""
         chosen = at_keyframes(self.odometry, rows)
-        return chosen.T_world_camera, chosen.covariance if self.stated else None
+        return chosen.T_world_camera, chosen.covariance if self.stated else None, chosen.flags if self.estimated else None
 
 
 def open_run_inputs(config: RunConfig) -> RunInputs:
@@ -194,7 +198,7 @@ def estimate_or_read(drive: RunInputs, config: RunConfig) -> FoundOdometry:
             source = depth_of_drive(drive, config, drive.used.tolist())
             depth = partial(_depth, source, frames)
         found = estimate_odometry(frames, drive.intrinsics, scale, config.visual, progress=True, depth=depth)
-        return FoundOdometry(found, stated=True)
+        return FoundOdometry(found, stated=True, estimated=True)
     frames = drive.frames
     poses = poses_of_frames(
         config.odometry, len(frames), frames.times, interpolate=is_bag(config.odometry), what="odometry", of="the images"

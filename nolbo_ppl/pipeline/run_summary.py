@@ -32,6 +32,7 @@ from nolbo_ppl.evaluation.sequence_truth import (
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import path_length, trajectory_errors
+from nolbo_ppl.odometry import StepFlag
 from nolbo_ppl.pipeline.noise_file import read_noise
 from nolbo_ppl.structures.detections import Detections
 
@@ -47,6 +48,15 @@ def trajectory_scores(run: RunFolder) -> dict[str, Any]:
     before, after = errors["before"]["ate"], errors["after"]["ate"]
     length = finite(path_length(run.truth_given))
     return {"path_length": length, **errors, "after_over_before": finite(after / before) if before > 0 else None}
+
+
+def odometry_scores(run: RunFolder) -> dict[str, Any]:
+    """How many steps of visual odometry between keyframes lacked what; empty where the odometry was given."""
+    flags = run.odometry_flags
+    if flags is None:
+        return {}
+    counts = {str(flag.name): int(np.sum((flags & flag) > 0)) for flag in StepFlag if flag}
+    return {"odometry": {"steps": len(flags), "doubtful": int(np.sum(flags > 0)), **counts}}
 
 
 def ground_truth_association_scores(
@@ -151,6 +161,7 @@ def summarise(
         "observations": len(table),
         "landmarks": sum(landmark.in_map for landmark in run.landmarks),
         "loop_pairs": run.slam_summary.get("loop_pairs"),
+        **odometry_scores(run),
         **trajectory_scores(run),
     }
     objects = None
@@ -172,6 +183,12 @@ def score_table(summary: Mapping[str, Any]) -> str:
     def number(value: Any, pattern: str = "{:.3f}") -> str:
         return "-" if value is None else pattern.format(value)
 
+    if "odometry" in summary:
+        steps = summary["odometry"]
+        why = ", ".join(f"{name} {count}" for name, count in steps.items() if count and name not in ("steps", "doubtful"))
+        rows.append(
+            ("steps of visual odometry, doubtful", f"{steps['steps']}, {steps['doubtful']}" + (f" ({why})" if why else ""))
+        )
     if "before" in summary:
         rows.append(("ATE before / after, m", f"{summary['before']['ate']:.3f} / {summary['after']['ate']:.3f}"))
         rows.append(("  after over before", number(summary["after_over_before"])))

@@ -68,7 +68,14 @@ def test_every_file_is_written(drive: Path, tmp_path: Path, capsys: pytest.Captu
         assert (np.linalg.eigvalsh(stored["covariance"]) > 0).all()
     report = json.loads((tmp_path / "odometry.json").read_text())
     assert report["frames"] == COUNT and report["config"]["detector"] == "orb" and report["options"]["scale"] == "truth"
-    assert report["ate"] < 0.1 and report["flags"] == {"FEW_MATCHES": 0, "STILL": 0, "ROTATION": 0, "NO_SCALE": 0, "TWIN": 0}
+    assert report["ate"] < 0.1 and report["flags"] == {
+        "FEW_MATCHES": 0,
+        "STILL": 0,
+        "ROTATION": 0,
+        "NO_SCALE": 0,
+        "TWIN": 0,
+        "WEAK": 0,
+    }
 
 
 def test_a_wheel_file_and_a_part_of_the_frames(drive: Path, tmp_path: Path) -> None:
@@ -77,6 +84,24 @@ def test_a_wheel_file_and_a_part_of_the_frames(drive: Path, tmp_path: Path) -> N
     found = read_trajectory(tmp_path / "odometry.txt")
     np.testing.assert_allclose(lengths_of(found.T_world_camera), lengths[2:4], rtol=1e-6)
     assert "ate" not in json.loads((tmp_path / "odometry.json").read_text())
+
+
+def test_depth_pictures_give_metres(drive: Path, tmp_path: Path) -> None:
+    """Millimetres of the two walls beside the images; with the wrong unit all lengths are wrong by its factor."""
+    truth = read_trajectory(drive / "truth.txt").T_world_camera
+    (tmp_path / "depth").mkdir()
+    for k in range(COUNT):
+        walls = np.full((SIZE, SIZE), 8.0 - truth[k, 2, 3])
+        walls[SIZE // 2 :] -= 4.0
+        Image.fromarray(np.round(1000 * walls).astype(np.uint16)).save(tmp_path / "depth" / f"{k:03d}.png")
+    more = ["--depth", tmp_path / "depth", "--depth-unit", 0.001, "--truth", drive / "truth.txt", "--config.patch", 11]
+    main(arguments(drive, tmp_path / "out", *more))
+    report = json.loads((tmp_path / "out" / "odometry.json").read_text())
+    assert report["ate"] < 0.03 and report["flags"]["NO_SCALE"] == 0
+    assert report["path_length"] == pytest.approx(report["true_path_length"], rel=0.03)
+    main(arguments(drive, tmp_path / "twice", "--scale", "depth", "--depth", tmp_path / "depth", "--depth-unit", 0.002))
+    twice = json.loads((tmp_path / "twice" / "odometry.json").read_text())
+    assert twice["path_length"] == pytest.approx(2 * report["path_length"], rel=0.05)
 
 
 def test_truth_by_time(drive: Path, tmp_path: Path) -> None:
@@ -97,6 +122,9 @@ def test_truth_by_time(drive: Path, tmp_path: Path) -> None:
     [
         (["--scale", "truth"], "--scale truth without a trajectory; give --truth FILE"),
         (["--scale", "file"], "--scale file without lengths"),
+        (["--scale", "depth"], "--scale depth without depth images"),
+        (["--depth", "no-such-folder"], "no such folder"),
+        (["--scale", "depth", "--depth", "no-such-folder", "--depth-unit", "0"], "--depth-unit: got 0"),
         (["--scale", "ground"], "--scale ground without the height of the camera"),
         (["--scale", "ground", "--camera-height", "-1"], "height of the camera: got -1"),
         (["--scale", "ground", "--camera-height", "1", "--first", "9"], "frames asked for"),

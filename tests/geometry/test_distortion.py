@@ -9,6 +9,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.distortion import (
     distort_points,
     undistort_boxes,
+    undistort_depth,
     undistort_image,
     undistort_points,
     zoom_without_rims,
@@ -72,6 +73,25 @@ def test_images_are_what_a_pinhole_camera_sees(model: str) -> None:
     expected = pattern(pixels).reshape(480, 640)
     seen = found[60:-60, 60:-60] > 0
     assert np.abs(found[60:-60, 60:-60].astype(float) - expected[60:-60, 60:-60])[seen].max() < 4
+
+
+@pytest.mark.parametrize("model", list(LENSES))
+def test_depth_is_moved_and_never_mixed(model: str) -> None:
+    """Two walls through the lens: the pinhole camera sees them where they are, at their own depths, at half size as well."""
+
+    def walls(points: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] + 0.3 * points[:, 1] < 380, 2.0, 5.0)
+
+    v, u = np.mgrid[:480, :640]
+    pixels = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)
+    seen = walls(undistort_points(pixels, CAMERA, model, LENSES[model])).reshape(480, 640)
+    for depth, step in ((seen, 1), (seen[::2, ::2], 2)):
+        found = undistort_depth(depth, CAMERA, model, LENSES[model], size=(640, 480))
+        expected = walls(pixels).reshape(480, 640)[::step, ::step]
+        inner = slice(70 // step, -(70 // step))
+        assert set(np.unique(found[inner, inner])) <= {0.0, 2.0, 5.0}
+        known = found[inner, inner] > 0
+        assert known.mean() > 0.9 and np.mean(found[inner, inner][known] != expected[inner, inner][known]) < 0.01 * step
 
 
 def test_no_rims_without_a_picture() -> None:

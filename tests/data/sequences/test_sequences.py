@@ -14,6 +14,7 @@ from nolbo_ppl.data.sequences import (
     CameraIntrinsics,
     ImageFolder,
     TumFolder,
+    UndistortedFrames,
     VideoFile,
     guessed_camera,
     open_frames,
@@ -159,6 +160,16 @@ def test_tum_folder(tmp_path: Path) -> None:
     assert depth[1] is None
     np.testing.assert_allclose(depth[0], np.full((16, 32), 1.0))  # type: ignore[arg-type]
     np.testing.assert_allclose(depth[2], np.full((16, 32), 2.0))  # type: ignore[arg-type]
+
+
+def test_depth_of_a_lens_is_undistorted_with_its_frames(tmp_path: Path) -> None:
+    frames = open_frames(tum(tmp_path / "t"))
+    assert frames.has_depth
+    lens = CameraIntrinsics(20.0, 20.0, 16.0, 8.0, model="radial-tangential", distortion=(0.05, 0.0, 0.0, 0.0))
+    made = UndistortedFrames(frames, lens)
+    depth = made.depth(0)
+    assert made.has_depth and made.depth(1) is None and depth is not None and depth.shape == (16, 32)
+    assert set(np.unique(depth)) == {1.0}  # zoomed in until every pixel was seen
 
 
 @pytest.mark.parametrize(
