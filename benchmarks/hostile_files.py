@@ -52,7 +52,7 @@ def run_answer(stage: faults.Stage, arguments: list[str], inputs: Path, name: st
     if "Traceback" in stage.said() or status not in (0, 2):
         return f"DEFECT status {status}: {said[-1]}"
     if status == 2:
-        return "clear: " + said[-1]
+        return "clear: " + " ".join(line.strip("│╭╮╰╯─ ") for line in said if any(map(str.isalnum, line)))
     summary = json.loads((out / "summary.json").read_text()) if (out / "summary.json").exists() else {}
     text = f"accepted, {summary.get('landmarks')} landmarks" if summary else "accepted"
     before, after = summary.get("before"), summary.get("after")

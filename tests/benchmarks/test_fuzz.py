@@ -14,7 +14,7 @@ from nolbo_ppl.errors import input_error
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import fuzz
 
-SECONDS = 12.0
+SECONDS = 8.0
 
 
 def test_no_reader_breaks() -> None:
