@@ -19,6 +19,14 @@ def _float64() -> Iterator[None]:
     torch.set_default_dtype(default)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of a GPU are skipped where there is none."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real data, outside the repository for its licences: `$NOLBO_DATA` or `../shared/data`."""

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "nolbo_ppl"
 
 LAYERS = (
-    ("errors", "_version", "_moved", "categories", "citations", "parallel", "progress"),
+    ("errors", "_version", "_moved", "categories", "citations", "parallel", "progress", "devices"),
     ("geometry",),
     ("structures",),
     ("io",),

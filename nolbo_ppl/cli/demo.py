@@ -25,6 +25,8 @@ class DemoConfig:
     """Which world."""
     model: str = "tiny"
     """Observation model: weights in the package, or a folder."""
+    device: str = "auto"
+    """Where its networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`; worlds are rendered on the CPU."""
     workers: int = 2
     """Processes that render the drive."""
 
@@ -41,7 +43,7 @@ def run(config: DemoConfig) -> DemoResult:
     Raises:
         NolboError: the folder holds something else, or there is no such model.
     """
-    return run_demo(config.out, config.seed, model=config.model, workers=config.workers)
+    return run_demo(config.out, config.seed, model=config.model, workers=config.workers, device=config.device)
 
 
 def main(args: Sequence[str] | None = None) -> None:

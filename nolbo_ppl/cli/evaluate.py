@@ -53,6 +53,8 @@ class EvaluateConfig:
     """Folder for metrics.json and the pictures."""
     model: str = "tiny"
     """Name of shipped weights, or a folder with model.safetensors and config.json."""
+    device: str = "auto"
+    """Where the networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
     scenes: Path | None = None
     """Folder of labelled scenes (scenes.jsonl); without it scenes are generated."""
     photographs: Path | None = None
@@ -291,7 +293,7 @@ def run(config: EvaluateConfig) -> Evaluation:
 
 
 def _evaluate(config: EvaluateConfig, folder: Path) -> Evaluation:
-    loaded = load(config.model)
+    loaded = load(config.model, config.device)
     model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
     scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
@@ -322,7 +324,7 @@ def run_photographs(config: EvaluateConfig) -> PhotographEvaluation:
 
 
 def _evaluate_photographs(config: EvaluateConfig, photographs: Path, folder: Path) -> PhotographEvaluation:
-    loaded = load(config.model)
+    loaded = load(config.model, config.device)
     model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
     peers = [OnnxPeer(path, model.config.categories) for path in config.peer]
     count = None if config.count == EvaluateConfig.count else config.count

@@ -36,6 +36,10 @@ class ObserveConfig:
     model: str = "photo"
     """Name of weights in the package (`photo` for photographs, `tiny` for generated scenes), or a folder with a model of your
     own."""
+    device: str = "auto"
+    """Where the networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
+    bf16: bool = False
+    """Networks in bfloat16."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
     camera: Path | None = None
@@ -73,7 +77,8 @@ def run(config: ObserveConfig) -> ObserveSummary:
     Raises:
         InputError: no images, no such model, or an output folder that holds something else.
     """
-    frames, model = open_frames(config.images, config.topic), load(config.model)
+    frames = open_frames(config.images, config.topic)
+    model = load(config.model, config.device, half_precision=config.bf16)
     recorded = recorded_camera(frames) if config.camera is None and config.intrinsics is None else None
     if recorded is not None:
         frames, camera = without_distortion(frames, recorded[0])

@@ -54,7 +54,7 @@ def suppress(
     iou = pairwise_iou(boxes[order], boxes[order])
     if group is not None:
         iou = torch.where(group[order][:, None] == group[order], iou, -1.0)
-    overlaps = ~(iou <= iou_threshold).numpy()
+    overlaps = ~(iou <= iou_threshold).cpu().numpy()
     removed = np.zeros(len(order), dtype=np.bool_)
     kept: list[int] = []
     owner = np.arange(len(order))
@@ -65,8 +65,8 @@ def suppress(
             owner[i] = i
             removed |= overlaps[i]
     stands_for = torch.empty_like(order)
-    stands_for[order] = order[torch.from_numpy(owner)]
-    return order[torch.tensor(kept, dtype=torch.long)], stands_for
+    stands_for[order] = order[torch.from_numpy(owner).to(order.device)]
+    return order[torch.tensor(kept, dtype=torch.long, device=order.device)], stands_for
 
 
 MIN_SIDE = 1.0

@@ -15,6 +15,7 @@ The inclusive terms are `-KL(p(z | truth) || q(z | I))` (the forward KL, as in w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -137,7 +138,7 @@ class SceneELBO(ELBO):
         if unknown:
             raise input_error("unknown term of the bound", got=unknown, expected=f"names among {sorted(known)}")
         for name, weight in weights.items():
-            if not torch.isfinite(torch.tensor(float(weight))):
+            if not math.isfinite(float(weight)):
                 raise input_error(f"weight of {name}", got=weight, expected="a finite number")
         self.weights = {name: float(weight) for name, weight in weights.items() if weight != 0}
 
@@ -154,8 +155,9 @@ class SceneELBO(ELBO):
             **kwargs: further arguments of both.
         """
         terms = self.terms(model, guide, *args, names=set(self.weights), **kwargs)
-        total = sum((self.weights[name] * value for name, value in terms.items()), torch.zeros(()))
-        return ElboResult(terms, -torch.as_tensor(total) / scenes)
+        weighted = [self.weights[name] * value for name, value in terms.items()]
+        total = torch.stack(weighted).sum() if weighted else torch.zeros((), device=_device_of(guide))
+        return ElboResult(terms, -total / scenes)
 
     def terms(
         self,
@@ -200,10 +202,8 @@ class SceneELBO(ELBO):
 
     def differentiable_loss(self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, **kwargs: Any) -> Tensor:
         """The weighted negative sum of the terms, nats summed over the batch, with its graph."""
-        total = torch.zeros(())
-        for _ in range(self.num_particles):
-            total = total + self.evaluate(model, guide, *args, **kwargs).loss / self.num_particles
-        return total
+        losses = [self.evaluate(model, guide, *args, **kwargs).loss for _ in range(self.num_particles)]
+        return torch.stack(losses).mean()
 
     def loss(self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, **kwargs: Any) -> float:
         """The same as a number, without gradients."""
@@ -301,8 +301,14 @@ def _reduce(
             positive = probability > 0
             value = torch.where(positive, probability * torch.where(positive, value, 0.0), 0.0).sum(dim, keepdim=True)
     if mask is not None:
-        value = torch.where(torch.as_tensor(mask), value, torch.zeros((), dtype=value.dtype))
+        value = torch.where(torch.as_tensor(mask, device=value.device), value, value.new_zeros(()))
     return (value * site["scale"]).sum()
+
+
+def _device_of(guide: Callable[..., Any]) -> torch.device | None:
+    """Where the parameters of a guide lie; None (torch's default) where it has none."""
+    parameters = guide.parameters() if isinstance(guide, torch.nn.Module) else iter(())
+    return next((parameter.device for parameter in parameters), None)
 
 
 class SceneLoss(torch.nn.Module):

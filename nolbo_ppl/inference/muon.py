@@ -19,6 +19,8 @@ from nolbo_ppl.models.layers import OutputLinear
 
 COLOURS = 3
 """Kernels over at most this many channels read the image itself."""
+FUSED = ("cpu", "cuda", "mps", "xpu")
+"""Kinds of devices that have a step of AdamW in one kernel."""
 
 
 def hidden_matrices(module: nn.Module) -> dict[str, nn.Parameter]:
@@ -38,7 +40,8 @@ def adamw(parameters: Iterable[nn.Parameter], lr: float, weight_decay: float) ->
         {"params": [p for p in known if p.dim() > 1], "weight_decay": weight_decay},
         {"params": [p for p in known if p.dim() <= 1], "weight_decay": 0.0},
     ]
-    return torch.optim.AdamW([group for group in groups if group["params"]], lr=lr, betas=(0.9, 0.99), fused=True)
+    fused = all(parameter.device.type in FUSED for parameter in known)
+    return torch.optim.AdamW([group for group in groups if group["params"]], lr=lr, betas=(0.9, 0.99), fused=fused)
 
 
 class MuonAdamW(torch.optim.Optimizer):

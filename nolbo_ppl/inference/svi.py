@@ -127,7 +127,8 @@ def step(state: OptimizerState, *args: Any, **kwargs: Any) -> tuple[OptimizerSta
     if not bool(torch.isfinite(torch.stack(torch._foreach_norm([p.detach() for p in parameters]))).all()):
         raise NolboError(f"weights after step {state.step} are not finite: is the learning rate of {rate:g} too large?")
     _update_average(state)
-    terms = {name: float(value.detach()) for name, value in result.terms.items()}
+    values = torch.stack([value.detach() for value in result.terms.values()]).tolist() if result.terms else []
+    terms = dict(zip(result.terms, values))  # one copy from the device, not one a term
     info = StepInfo(state.step, float(result.loss.detach()), float(norm), rate, terms)
     state.step += 1
     return state, info
@@ -151,7 +152,8 @@ def average_over_processes(state: OptimizerState) -> None:
     moments = [value for of in state.optimizer.state.values() for value in of.values()]
     tensors = [*state.module.state_dict().values(), *state.average.values(), *moments]
     floating = [value for value in tensors if torch.is_tensor(value) and value.is_floating_point()]
-    together = torch.cat([value.detach().flatten() for value in floating])
+    device = next(state.module.parameters()).device  # counts of steps lie on the CPU
+    together = torch.cat([value.detach().flatten().to(device) for value in floating])
     distributed.all_reduce(together)
     together /= distributed.get_world_size()
     for value, mean in zip(floating, together.split([value.numel() for value in floating])):
@@ -181,7 +183,7 @@ def module_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def restore(state: OptimizerState, tensors: dict[str, Tensor], at_step: int) -> OptimizerState:
     """Put a state back to what `state_tensors` saved, bit for bit."""
     state.module.load_state_dict(module_tensors(tensors))
-    state.average = {name: value.clone() for name, value in part_of(tensors, "average/").items()}
+    state.average = {name: value.to(state.average[name].device, copy=True) for name, value in part_of(tensors, "average/").items()}
     restore_optimizer(state.optimizer, part_of(tensors, "optimizer/"), dict(state.module.named_parameters()))
     state.step = at_step
     return state

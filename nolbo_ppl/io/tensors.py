@@ -20,7 +20,7 @@ from nolbo_ppl.io.files import atomic_path, existing_file, reading
 def save_tensors(path: str | PathLike[str], tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
     """Write tensors and a JSON-able `meta` into one safetensors file, atomically. Raises `OSError` when it cannot be written."""
     with atomic_path(path) as temporary:
-        contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+        contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
         try:
             save_file(contiguous, temporary, metadata={"meta": json.dumps(meta)})
         except SafetensorError as error:  # a full disk
@@ -75,6 +75,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
     Raises:
         InputError: a parameter nobody knows, or values that do not fit it; names it.
     """
+    fused = bool(optimizer.param_groups) and any(group.get("fused") for group in optimizer.param_groups)
     for name, tensor in tensors.items():
         parameter, _, key = name.rpartition("/")
         if parameter not in parameters:
@@ -82,7 +83,8 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
         if tensor.numel() not in (1, parameters[parameter].numel()):
             expected = tuple(parameters[parameter].shape)
             raise input_error(f"state {name} of the optimiser", got=tuple(tensor.shape), expected=expected)
-        optimizer.state[parameters[parameter]][key] = tensor.clone()
+        device = tensor.device if key == "step" and not fused else parameters[parameter].device
+        optimizer.state[parameters[parameter]][key] = tensor.to(device, copy=True)
 
 
 def check_tensors(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], file: str | PathLike[str]) -> None:

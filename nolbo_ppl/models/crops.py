@@ -60,7 +60,7 @@ def cut_out(
     extent = (box[:, 2:] - box[:, :2]).clamp_min(1e-3)
     factor = box_side / extent.amax(-1).clamp_min(MIN_SIDE)
     level = (-torch.log2(factor)).round().long().clamp(0, len(levels) - 1)
-    step = torch.arange(side, dtype=box.dtype) + 0.5 - side / 2
+    step = torch.arange(side, dtype=box.dtype, device=box.device) + 0.5 - side / 2
     y, x = torch.meshgrid(step, step, indexing="ij")
     offset = torch.stack((x, y), -1).flatten(0, 1)
     image = box.new_zeros(len(box), side * side, 3, dtype=levels[0].dtype)

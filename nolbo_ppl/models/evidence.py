@@ -82,7 +82,7 @@ def bin_best(
     best = score.new_full((len(box), regions), -torch.inf).scatter_reduce(1, region, score, "amax")
     winner = score == best.gather(1, region)
     index = region.new_full((len(box), regions + 1), -1)
-    number = torch.arange(box.shape[1]).expand(len(box), -1)
+    number = torch.arange(box.shape[1], device=box.device).expand(len(box), -1)
     index.scatter_(1, torch.where(winner, region, regions), number)
     index = index[:, :regions]
     return index.clamp_min(0), index >= 0
@@ -104,7 +104,7 @@ def gather_evidence(
     def at(values: Tensor) -> Tensor:
         return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
 
-    cell = torch.arange(rows * columns).repeat_interleave(config.predictors)
+    cell = torch.arange(rows * columns, device=box.device).repeat_interleave(config.predictors)
     x, y = (cell % columns + 0.5) * config.stride, (cell // columns + 0.5) * config.stride
     half = config.stride / 2
     empty = torch.stack((x - half, y - half, x + half, y + half), -1).to(box.dtype)
@@ -124,8 +124,9 @@ def detector_evidence(predictions: Predictions, rows: int, columns: int, config:
     rest = [label for label in range(CLASSES) if label not in (*own, TRUCK)]
     with torch.no_grad():
         of_class = nn.functional.logsigmoid(predictions.classes)
-        known = of_class[..., own]
-        labels = torch.cat((known, of_class[..., [TRUCK]], of_class[..., rest].amax(-1, keepdim=True)), -1)
+        device = of_class.device
+        known, others = (of_class.index_select(-1, torch.tensor(which, device=device)) for which in (own, rest))
+        labels = torch.cat((known, of_class[..., TRUCK, None], others.amax(-1, keepdim=True)), -1)
         joint = (nn.functional.logsigmoid(predictions.objectness) + known.amax(-1)).clamp(max=-1e-6)
         log_odds = joint - torch.log(-torch.expm1(joint))
     return gather_evidence(predictions.box, log_odds, labels, predictions.features, rows, columns, config)

@@ -172,7 +172,7 @@ class GenerativeModel(nn.Module):
 
 def _subset(order: Tensor | None, index: Tensor, count: int) -> Tensor:
     """Positions of a random subset of so many objects, in their own order; by torch's generator when none is given."""
-    rank = torch.rand(len(index)) if order is None else order.flatten()[index]
+    rank = torch.rand(len(index), device=index.device) if order is None else order.flatten()[index]
     return rank.argsort(stable=True)[:count].sort().values
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+from typing import Any
+
 import pyro
 import pyro.distributions as dist
 import torch
@@ -9,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from pyro import poutine
 from torch import Tensor, nn
 
+from nolbo_ppl.devices import mixed_precision
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.models.backbones import check_image, make_encoder, normalise_image
 from nolbo_ppl.models.distributions import (
@@ -82,7 +86,7 @@ class Guide(nn.Module):
         check_image(image)
         dtype = self.head.objectness.weight.dtype
         x = normalise_image(image, dtype)
-        if dtype == torch.float32:  # faster convolutions on CPUs
+        if dtype == torch.float32:  # faster convolutions on CPUs, and on GPUs in half precision
             x = x.contiguous(memory_format=torch.channels_last)
         with self._autocast():
             maps, fine = self.encoder(x)
@@ -109,7 +113,7 @@ class Guide(nn.Module):
         """
         cell, predictor = region // self.config.predictors, region % self.config.predictors
         with self._autocast():
-            raw = self.head(encoding.features[row, cell])[torch.arange(len(row)), predictor]
+            raw = self.head(encoding.features[row, cell])[torch.arange(len(row), device=row.device), predictor]
             raw = raw.to(self.head.objectness.weight.dtype)
             if look:
                 raw = self.head.refine(raw, encoding.fine, row, cell, encoding.columns, box)
@@ -121,8 +125,8 @@ class Guide(nn.Module):
             raw = self.head(torch.gather(encoding.features, 1, index))
         return raw.to(self.head.objectness.weight.dtype)
 
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision)
+    def _autocast(self) -> AbstractContextManager[Any]:
+        return mixed_precision(self.head.objectness.weight.device, self.half_precision)
 
     def observe(self, batch: SceneBatch) -> ObservedScene:
         """Encode a batch and find the responsible region of each object."""
@@ -137,7 +141,7 @@ class Guide(nn.Module):
             predictor, assigned = assign_predictors(cell, iou, batch.present)
             region = cell * self.config.predictors + predictor
             regions = encoding.objectness_logit.shape[1]
-            is_object = torch.zeros(len(cell), regions + 1, dtype=torch.bool)  # the last column takes the rest
+            is_object = torch.zeros(len(cell), regions + 1, dtype=torch.bool, device=cell.device)  # the last column takes the rest
             is_object.scatter_(1, torch.where(assigned, region, regions), True)
             has_range = batch.has_position & batch.has_size
             assignment = Assignment(
@@ -174,7 +178,7 @@ class Guide(nn.Module):
         implementation)."""
         p, columns = self.config.predictors, encoding.columns
         cell = cell_of(box, encoding.rows, columns, self.config.stride)
-        region = (cell[:, None] * p + torch.arange(p)).flatten()
+        region = (cell[:, None] * p + torch.arange(p, device=cell.device)).flatten()
         q = self.parameters_at(encoding, row.repeat_interleave(p), region, look=False)
         own = decode_box(q.box_loc, region // p, columns, self.config).unflatten(0, (-1, p))
         return cell * p + box_iou(own, box[:, None]).argmax(-1)
@@ -268,7 +272,7 @@ def known_cells(
         return None
     known = torch.ones_like(is_object)
     if batch.ignore is not None:
-        centre = cell_centre(torch.arange(rows * columns), columns, config.stride, batch.ignore.dtype)
+        centre = cell_centre(torch.arange(rows * columns, device=is_object.device), columns, config.stride, batch.ignore.dtype)
         box = batch.ignore[:, None]
         inside = (centre[:, None] > box[..., :2]).all(-1) & (centre[:, None] < box[..., 2:]).all(-1)
         known &= ~inside.any(-1).repeat_interleave(config.predictors, 1)
@@ -286,11 +290,12 @@ def assign_predictors(
     that finds none free is left out (second result false).
     """
     b, m, p = iou.shape
-    order = torch.where(present, iou.max(-1).values, iou.new_tensor(-1.0)).argsort(dim=1, descending=True, stable=True)
-    taken = torch.zeros(b, m, p, dtype=torch.bool)  # predictors already taken in the cell of each object
-    predictor = torch.zeros(b, m, dtype=torch.long)
-    assigned = torch.zeros(b, m, dtype=torch.bool)
-    rows = torch.arange(b)
+    device = iou.device
+    order = torch.where(present, iou.max(-1).values, -1.0).argsort(dim=1, descending=True, stable=True)
+    taken = torch.zeros(b, m, p, dtype=torch.bool, device=device)  # predictors already taken in the cell of each object
+    predictor = torch.zeros(b, m, dtype=torch.long, device=device)
+    assigned = torch.zeros(b, m, dtype=torch.bool, device=device)
+    rows, predictors = torch.arange(b, device=device), torch.arange(p, device=device)
     same_cell = cell[:, :, None] == cell[:, None, :]
     for rank in range(m):
         slot = order[:, rank]
@@ -299,5 +304,5 @@ def assign_predictors(
         free = present[rows, slot] & (score[rows, best] >= 0)
         predictor[rows, slot] = best
         assigned[rows, slot] = free
-        taken |= (same_cell[rows, slot] & free[:, None])[..., None] & (torch.arange(p) == best[:, None])[:, None]
+        taken |= (same_cell[rows, slot] & free[:, None])[..., None] & (predictors == best[:, None])[:, None]
     return predictor, assigned

@@ -98,7 +98,7 @@ class HybridGuide(Guide):
             raw = self.head(features)
             logit = self.head.objectness(features)
         raw, logit = raw.to(dtype), logit.to(dtype)
-        cell = torch.arange(raw.shape[1])[:, None].expand(-1, config.predictors)
+        cell = torch.arange(raw.shape[1], device=raw.device)[:, None].expand(-1, config.predictors)
         box = REDUCTION * decode_box(self.head.box_latent(raw), cell, maps.shape[3], config).flatten(1, 2)
         labels = torch.log_softmax(raw[..., : self.head.sizes[0]], -1).flatten(1, 2)
         nothing = labels.new_zeros(*labels.shape[:2], 0)
@@ -115,7 +115,8 @@ class HybridGuide(Guide):
     def encode(self, image: Tensor) -> HybridEncoding:
         """Gather the evidence of whole images and weigh it; see `gather`."""
         one = self.gather(image)
-        cell = torch.arange(one.rows * one.columns).repeat_interleave(self.config.predictors).expand(len(image), -1)
+        cell = torch.arange(one.rows * one.columns, device=image.device).repeat_interleave(self.config.predictors)
+        cell = cell.expand(len(image), -1)
         fused = self.fusion(one.detector, one.scene, one.context, cell, one.columns)
         box = decode_box(fused.box_loc, cell, one.columns, self.config)
         return HybridEncoding(one.features, fused.objectness_logit, one.rows, one.columns, (), fused, box, one.levels)
@@ -164,7 +165,7 @@ class HybridGuide(Guide):
         dtype = self.head.objectness.weight.dtype
         with torch.no_grad():
             crops = cut_out(levels, row, box.detach())
-        number, cells = torch.arange(len(row)), SIDE // self.config.stride
+        number, cells = torch.arange(len(row), device=row.device), SIDE // self.config.stride
         cell = torch.full_like(number, (cells * cells) // 2)
         with self._autocast():
             maps, fine = self.encoder(crops.image)
@@ -190,7 +191,7 @@ class HybridGuide(Guide):
                 encoding.box, encoding.objectness_logit, batch.box, batch.present, encoding.rows, encoding.columns, config
             )
             regions = encoding.objectness_logit.shape[1]
-            is_object = torch.zeros(len(region), regions + 1, dtype=torch.bool)  # the last column takes the rest
+            is_object = torch.zeros(len(region), regions + 1, dtype=torch.bool, device=region.device)  # the last takes the rest
             is_object = is_object.scatter(1, torch.where(assigned, region, regions), True)[:, :regions]
             counted = known_regions(encoding.box, fused.label_logits, batch) | is_object
             cell = region // config.predictors
@@ -252,9 +253,9 @@ def assign_regions(
     b, m, k = quality.shape
     best = torch.where(present, quality.amax(-1), -1.0)
     order = best.argsort(dim=1, descending=True, stable=True)
-    free = torch.ones(b, k, dtype=torch.bool)
-    region = torch.zeros(b, m, dtype=torch.long)
-    images = torch.arange(b)
+    free = torch.ones(b, k, dtype=torch.bool, device=box.device)
+    region = torch.zeros(b, m, dtype=torch.long, device=box.device)
+    images = torch.arange(b, device=box.device)
     for rank in range(m):
         slot = order[:, rank]
         choice = torch.where(free, quality[images, slot], -1.0).argmax(-1)

@@ -56,22 +56,22 @@ def blank_scene(
         category: label of each object, which gives its symmetry; -1 or None where it is unknown (no symmetry).
         intrinsics: [fx, fy, cx, cy] in px of a camera; None for one of 90 degrees.
     """
-    n, side, like = len(viewpoint), config.image_size, viewpoint
+    n, side, like, device = len(viewpoint), config.image_size, viewpoint, viewpoint.device
     rows, columns = grid_size(side, side, config)
-    cell = torch.full((n, 1), (rows // 2) * columns + columns // 2)
-    yes, zero = torch.ones(n, 1, dtype=torch.bool), like.new_zeros(n, 1)
-    label = torch.full((n,), -1) if category is None else category
-    symmetry = torch.where(label >= 0, torch.tensor(config.symmetry)[label.clamp_min(0)], 1)
+    cell = torch.full((n, 1), (rows // 2) * columns + columns // 2, device=device)
+    yes, zero = torch.ones(n, 1, dtype=torch.bool, device=device), like.new_zeros(n, 1)
+    label = torch.full((n,), -1, device=device) if category is None else category
+    symmetry = torch.where(label >= 0, torch.tensor(config.symmetry, device=device)[label.clamp_min(0)], 1)
     camera = like.new_tensor([side / 2, side / 2, side / 2, side / 2]) if intrinsics is None else intrinsics
     centre = like.new_tensor([(columns // 2 + 0.5) * config.stride, (rows // 2 + 0.5) * config.stride])
     half = config.stride
     batch = SceneBatch(
-        image=torch.zeros(n, 3, side, side, dtype=torch.uint8),
+        image=torch.zeros(n, 3, side, side, dtype=torch.uint8, device=device),
         intrinsics=camera.expand(n, 4),
         present=yes,
         box=torch.cat((centre - half, centre + half)).expand(n, 1, 4),
         category=label[:, None],
-        instance=torch.full((n, 1), -1),
+        instance=torch.full((n, 1), -1, device=device),
         viewpoint=viewpoint[:, None],
         has_viewpoint=yes,
         symmetry=symmetry[:, None],
@@ -79,12 +79,12 @@ def blank_scene(
         has_position=yes,
         diagonal=zero + 1,
         has_size=yes,
-        voxels=torch.zeros(n, 1, config.voxel_size**3 // 8, dtype=torch.uint8),
+        voxels=torch.zeros(n, 1, config.voxel_size**3 // 8, dtype=torch.uint8, device=device),
         has_voxels=yes,
         visibility=zero + 1,
     )
     regions = rows * columns * config.predictors
-    is_object = torch.zeros(n, regions, dtype=torch.bool)
+    is_object = torch.zeros(n, regions, dtype=torch.bool, device=device)
     is_object[:, int(cell[0, 0]) * config.predictors] = True
     assignment = Assignment(
         cell=cell,
@@ -147,16 +147,18 @@ def prior_predictive(
             raise input_error(f"{name} of each object", got=len(given), expected=f"{count} rows")
     if count < 1:
         raise input_error("number of objects to draw", got=count, expected="at least 1")
-    config, dtype = model.config, next(model.parameters()).dtype
+    config, like = model.config, next(model.parameters())
+    device, dtype = like.device, like.dtype
     training = model.training
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []), torch.no_grad():
         torch.manual_seed(seed)
         if category is None:
-            category = torch.randint(len(config.categories), (count,))
+            category = torch.randint(len(config.categories), (count,), device="cpu")
         if viewpoint is None:
-            azimuth = (2 * torch.rand(count, dtype=dtype) - 1) * math.pi
+            azimuth = (2 * torch.rand(count, dtype=dtype, device="cpu") - 1) * math.pi
             viewpoint = torch.nn.functional.pad(azimuth[:, None], (0, 2))
-        scene = blank_scene(config, viewpoint.to(dtype), category)
+        category = category.to(device)
+        scene = blank_scene(config, viewpoint.to(device, dtype), category)
         model.eval()
         drawn = poutine.condition(poutine.uncondition(model), {"label": category[:, None]})
         nodes = poutine.trace(drawn).get_trace(scene).nodes

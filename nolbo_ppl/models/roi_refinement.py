@@ -28,7 +28,7 @@ def roi_grid(box: Float[Tensor, "n 4"], side: int) -> Float[Tensor, "n side side
     """Points (x, y), px, of a regular grid over each enlarged box, row by row: the centres of `side` x `side` parts."""
     centre = (box[:, :2] + box[:, 2:]) / 2
     extent = ((box[:, 2:] - box[:, :2]) * MARGIN).clamp_min(MIN_SIDE)
-    step = (torch.arange(side, dtype=box.dtype) + 0.5) / side - 0.5
+    step = (torch.arange(side, dtype=box.dtype, device=box.device) + 0.5) / side - 0.5
     y, x = torch.meshgrid(step, step, indexing="ij")
     return centre[:, None, None] + torch.stack((x, y), -1) * extent[:, None, None]
 

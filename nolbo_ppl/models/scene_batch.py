@@ -85,6 +85,11 @@ class SceneBatch:
         """A copy with other fields."""
         return dataclasses.replace(self, **changes)
 
+    @property
+    def device(self) -> torch.device:
+        """Where it lies (`nolbo_ppl.devices.placed` puts it elsewhere)."""
+        return self.image.device
+
     def to(self, dtype: torch.dtype) -> SceneBatch:
         """A copy with floating-point fields of another precision."""
         fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -222,12 +227,12 @@ def decode_range(
 
 def pack_bits(voxels: Bool[Tensor, "*n v v v"]) -> UInt8[Tensor, "*n bytes"]:
     """Pack occupancy into bits as `numpy.packbits` does, C order."""
-    weights = torch.tensor([128, 64, 32, 16, 8, 4, 2, 1], dtype=torch.uint8)
+    weights = torch.tensor([128, 64, 32, 16, 8, 4, 2, 1], dtype=torch.uint8, device=voxels.device)
     return (voxels.flatten(-3).unflatten(-1, (-1, 8)).to(torch.uint8) * weights).sum(-1, dtype=torch.uint8)
 
 
 def unpack_bits(packed: UInt8[Tensor, "*n bytes"], size: int) -> Bool[Tensor, "*n v v v"]:
     """Occupancy grids of packed bits (C order, most significant bit first, as `numpy.packbits` writes them)."""
-    shifts = torch.arange(7, -1, -1, dtype=torch.uint8)
+    shifts = torch.arange(7, -1, -1, dtype=torch.uint8, device=packed.device)
     bits = (packed[..., None] >> shifts) & 1
     return bits.flatten(-2).unflatten(-1, (size, size, size)).bool()

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from nolbo_ppl.devices import mixed_precision
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm3d
 
@@ -62,7 +63,7 @@ class VoxelDecoder(nn.Module):
 
     def forward(self, latent: Float[Tensor, "n d"]) -> Float[Tensor, "n v v v"]:
         """Occupancy logits, axes x, y, z of the canonical frame."""
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
+        with mixed_precision(latent.device, self.half_precision):
             logits = self.layers(self.dense(latent).unflatten(-1, (self.channels, 4, 4, 4)))
         return logits.squeeze(1).to(latent.dtype)
 
@@ -115,7 +116,7 @@ class VoxelEncoder(nn.Module):
 
     def forward(self, voxels: Float[Tensor, "n v v v"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
         """Mean and scale of the latent of each shape; scales stay between exp(-6) and exp(2)."""
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
+        with mixed_precision(voxels.device, self.half_precision):
             features = self.layers(2 * voxels[:, None] - 1).flatten(1)
         loc, log_scale = self.dense(features.to(voxels.dtype)).chunk(2, -1)
         return loc, bounded_exp(log_scale, -6.0, 2.0)

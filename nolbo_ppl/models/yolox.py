@@ -183,7 +183,8 @@ class YoloxNano(nn.Module):
         for level, stride, head in zip(self.maps(image), STRIDES, self.heads):
             box, obj, cls, feature = (part.flatten(2).transpose(1, 2) for part in head(level))
             height, width = level.shape[2:]
-            y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+            down, across = (torch.arange(side, device=image.device) for side in (height, width))
+            y, x = torch.meshgrid(down, across, indexing="ij")
             corner = torch.stack((x, y), -1).flatten(0, 1).to(image.dtype)
             box = box.to(image.dtype)
             centre = (box[..., :2] + corner) * stride

@@ -34,7 +34,7 @@ class DemoResult:
         return self.run / "report.html"
 
 
-def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1) -> DemoResult:
+def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1, device: str = "auto") -> DemoResult:
     """Render a small street drive into `out/drive` and run it into `out/run`; what is there already is not made again.
 
     Visual odometry has the lengths of its steps from the ground under the camera, so that nothing of the truth enters the map.
@@ -44,6 +44,7 @@ def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1)
         seed: which world; no training has seen its shapes.
         model: observation model.
         workers: processes that render.
+        device: where the networks run.
 
     Raises:
         NolboError: the folders hold something else, or there is no such model.
@@ -61,6 +62,7 @@ def run_demo(out: Path, seed: int = 0, *, model: str = "tiny", workers: int = 1)
             truth_objects=drive,
             out=run,
             model=model,
+            device=device,
             seed=seed,
             camera_height=world.camera_height,
             camera_pitch=math.radians(world.tilt),

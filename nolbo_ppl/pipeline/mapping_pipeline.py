@@ -57,7 +57,7 @@ class ObjectMappingPipeline:
     @cached_property
     def model(self) -> ObservationModel:
         """The observation model."""
-        return load(self.config.model)
+        return load(self.config.model, self.config.device)
 
     @cached_property
     def slam_config(self) -> SlamConfig:

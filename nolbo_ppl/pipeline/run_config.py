@@ -43,6 +43,8 @@ class RunConfig:
     """Folder of a drive (`nolbo drive`), for figures against its true objects."""
     model: str = field(default="tiny", metadata=affects("observe", "model"))
     """Observation model: name of weights in the package, or a folder."""
+    device: str = field(default="auto", metadata=affects(None))
+    """Where its networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
     online: bool = field(default=False, metadata=affects("slam"))
     """Run keyframe by keyframe on iSAM2 instead of in one batch."""
     scale_drift: bool = field(default=False, metadata=affects("slam"))

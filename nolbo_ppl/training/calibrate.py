@@ -12,6 +12,7 @@ from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 from torch import Tensor
 
+from nolbo_ppl.devices import placed
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import wrap_angle
 from nolbo_ppl.inference.posterior.decode import box_sigmas, position_covariance
@@ -93,9 +94,12 @@ def _collect(model: Nolbo, batches: Iterable[SceneBatch]) -> dict[str, Tensor]:
     found: dict[str, list[Tensor]] = {}
 
     def add(name: str, value: Tensor) -> None:
+        value = value.cpu()  # the factors are fitted in double precision, which not every device has
         found.setdefault(name, []).append(value.double() if value.is_floating_point() else value)
 
+    device = next(model.parameters()).device
     for batch in batches:
+        batch = placed(batch, device)
         scene = model.guide.observe(batch)
         where, q = scene.assignment, scene.posterior.at_map_category(model.story.prior.label_mean())
         known = torch.ones_like(where.is_object) if where.counted is None else where.counted
@@ -162,7 +166,9 @@ def _positions(
 
 def _shape_correlation(found: dict[str, Tensor]) -> float:
     """Of the objects whose shape the table knows."""
-    index = found.get("shape_index", torch.zeros(0, dtype=torch.long))
+    if "shape_index" not in found:
+        return 0.0
+    index = found["shape_index"]
     return view_correlation(found["shape_error"][index >= 0], index[index >= 0]) if len(index) else 0.0
 
 
@@ -196,7 +202,7 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
     slope, shift = _fit(objectness, [0.0, 0.0])
     label_slope = _fit(label, [0.0])[0] if len(found["category"]) else 0.0
     concentration = _fit(azimuth, [0.0])[0] if len(found["azimuth"]) else 0.0
-    factor = torch.tensor([slope, label_slope, concentration]).exp().tolist()
+    factor = [math.exp(value) for value in (slope, label_slope, concentration)]
     box_scale = region_factor(found["box"], 4)
     range_scale = 1.0
     if len(found["position"]):

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from nolbo_ppl.devices import placed
 from nolbo_ppl.geometry.boxes import box_area
 from nolbo_ppl.models.evidence import WEAK, Evidence, Fusion
 from nolbo_ppl.models.hybrid_guide import SAME_OBJECT, GatheredEvidence, HybridGuide, region_quality
@@ -112,8 +113,9 @@ def gather_table(guide: HybridGuide, batch: SceneBatch) -> EvidenceTable:
     strength = torch.maximum(found.detector.log_odds, found.scene.log_odds)
     strength = strength.scatter_add(1, torch.where(batch.present, region, 0), 100.0 * batch.present.to(strength.dtype))
     candidate = strength.topk(min(CANDIDATES, regions), dim=1).indices
-    owner = torch.full((len(region), regions + 1), -1)
-    owner.scatter_(1, torch.where(batch.present, region, regions), torch.arange(region.shape[1]).expand_as(region))
+    owner = torch.full((len(region), regions + 1), -1, device=region.device)
+    number = torch.arange(region.shape[1], device=region.device).expand_as(region)
+    owner.scatter_(1, torch.where(batch.present, region, regions), number)
     slot = owner[:, :regions].gather(1, candidate)
     is_object, at = slot >= 0, slot.clamp_min(0)
     cell = candidate // config.predictors
@@ -123,7 +125,7 @@ def gather_table(guide: HybridGuide, batch: SceneBatch) -> EvidenceTable:
     if len(row):
         raw, _ = guide.look_at(found.levels, row, true_box[row, column])
         look[row, column] = torch.log_softmax(raw[:, : look.shape[-1]], -1)
-    return EvidenceTable(
+    table = EvidenceTable(
         found.detector.at(candidate),
         found.scene.at(candidate),
         found.context,
@@ -135,6 +137,7 @@ def gather_table(guide: HybridGuide, batch: SceneBatch) -> EvidenceTable:
         encode_box(true_box, cell, found.columns, config),
         look,
     )
+    return placed(table, torch.device("cpu"))
 
 
 def _assign(found: GatheredEvidence, batch: SceneBatch, config: ModelConfig) -> tuple[Int[Tensor, "b m"], Bool[Tensor, "b k"]]:
@@ -145,10 +148,11 @@ def _assign(found: GatheredEvidence, batch: SceneBatch, config: ModelConfig) -> 
     ]
     quality = torch.maximum(parts[0][0], parts[1][0] * 0.999)  # of equals the detector's
     overlap = torch.maximum(parts[0][1], parts[1][1])
-    taken = torch.zeros(quality[:, 0].shape, dtype=torch.bool)
-    region = torch.zeros(batch.present.shape, dtype=torch.long)
+    device = quality.device
+    taken = torch.zeros(quality[:, 0].shape, dtype=torch.bool, device=device)
+    region = torch.zeros(batch.present.shape, dtype=torch.long, device=device)
     order = torch.where(batch.present, quality.amax(-1), -1.0).argsort(dim=1, descending=True, stable=True)
-    images = torch.arange(len(region))
+    images = torch.arange(len(region), device=device)
     for rank in range(region.shape[1]):
         slot = order[:, rank]
         choice = torch.where(taken, -1.0, quality[images, slot]).argmax(-1)

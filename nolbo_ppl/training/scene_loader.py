@@ -138,9 +138,10 @@ class ShapeTable:
         """
         model.shape_guide.eval()
         sides = [self.packed, mirror_voxels(self.packed)] if mirrored and len(self) else [self.packed]
-        parts = [model.shape_guide.posterior(part) for side in sides for part in side.split(256)]
-        self.loc = torch.cat([loc for loc, _ in parts])
-        self.scale = torch.cat([scale for _, scale in parts])
+        device = next(model.shape_guide.parameters()).device
+        parts = [model.shape_guide.posterior(part.to(device)) for side in sides for part in side.split(256)]
+        self.loc = torch.cat([loc.cpu() for loc, _ in parts])
+        self.scale = torch.cat([scale.cpu() for _, scale in parts])
 
     def add_shape_targets(self, batch: SceneBatch, mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
         """The batch with the teacher's posterior of each object; a shape that is not in the table is unknown.

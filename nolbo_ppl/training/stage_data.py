@@ -16,6 +16,7 @@ from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.data.loader import Scenes, prefetch
 from nolbo_ppl.data.scene_cache import write_cache
+from nolbo_ppl.devices import each_pinned
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
@@ -39,8 +40,9 @@ MIN_HELD_OUT = 512
 class TrainingData:
     """The data of all stages: generated and cached, of a folder, or of several of these in fixed shares."""
 
-    def __init__(self, config: TrainConfig, rank: int, world: int) -> None:
+    def __init__(self, config: TrainConfig, rank: int, world: int, device: torch.device | None = None) -> None:
         self.config, self.rank, self.world = config, rank, world
+        self.device = torch.device("cpu") if device is None else device
         self.model = config.model()
         self.augmentation: Augmentation | None = None
         if config.augment:
@@ -165,7 +167,7 @@ class TrainingData:
                     yield self.table.batch(config.shape_batch, seed, step, latent, part)
                     step += 1
 
-            return shapes()
+            return each_pinned(shapes(), self.device)
         seed = 3 * config.seed + (1 if stage == "single" else 2)  # one for all parts: they choose the same size
 
         def loader_of(scenes: Scenes, table: ShapeTable, batch: int) -> SceneLoader:
@@ -186,7 +188,7 @@ class TrainingData:
                 yield supply.batch(step)
                 step += 1
 
-        return prefetch(scenes())
+        return prefetch(each_pinned(scenes(), self.device), depth=config.prefetch)
 
     def validation(self, count: int | None) -> Iterator[SceneBatch]:
         """Held-out batches, without augmentation, with the teacher's latents and the same noise each time."""

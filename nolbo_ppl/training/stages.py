@@ -127,7 +127,8 @@ class StageRun:
 
     def averaged(self) -> Nolbo:
         """A copy of the networks with the averaged weights, in evaluation mode."""
-        copy = Nolbo.from_seed(self.model.config, 0).to(next(self.model.parameters()).dtype)
+        like = next(self.model.parameters())
+        copy = Nolbo.from_seed(self.model.config, 0).to(like.device, like.dtype)
         copy.load_state_dict(self.state.average)
         return copy.eval().requires_grad_(False)
 
@@ -152,6 +153,6 @@ def shorten(stage: TrainingStage, steps: int) -> TrainingStage:
 
 
 def seeded_noise(seed: int, step: int, *shape: int) -> torch.Tensor:
-    """Standard normal noise that depends on seed and step only."""
-    generator = torch.Generator().manual_seed((seed * 1_000_003 + step) % 2**63)
-    return torch.randn(*shape, generator=generator)
+    """Standard normal noise that depends on seed and step only: drawn on the CPU, so that it is the same for every device."""
+    generator = torch.Generator("cpu").manual_seed((seed * 1_000_003 + step) % 2**63)
+    return torch.randn(*shape, generator=generator, device="cpu")

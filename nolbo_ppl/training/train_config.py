@@ -33,6 +33,9 @@ FREE_FIELDS = (
     "tensorboard",
     "resume",
     "evaluate_every",
+    "device",
+    "compile",
+    "prefetch",
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
 NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False}
@@ -146,6 +149,13 @@ class TrainConfig:
     instance is another one. Leave it out where left and right set categories apart."""
     bf16: bool = True
     """Networks in bfloat16."""
+    device: str = "auto"
+    """`auto` (a CUDA device where there is one, else Apple's, else the CPU), `cpu`, `cuda`, `cuda:N` or `mps`. A run may go on
+    on another one."""
+    compile: bool = False
+    """Let torch compile encoder and decoder (`torch.compile`); a GPU gains by it, the CPUs measured do not (docs/training.md)."""
+    prefetch: int = 2
+    """Batches prepared ahead of the step that takes them, in page-locked memory for CUDA devices."""
     threads: int = 0
     """Threads of torch; 0 leaves torch's own choice."""
     workers: int = 2
@@ -200,6 +210,7 @@ class TrainConfig:
             "count",
             "workers",
             "average_every",
+            "prefetch",
         )
         for name in at_least_one:
             if getattr(self, name) < 1:
@@ -265,7 +276,7 @@ class TrainConfig:
     def model(self) -> ModelConfig:
         """Configuration of the networks. Raises `InputError` where initial weights and other fields disagree."""
         if self.start is not None and self.initial_part == "all":
-            config = load(self.start).config
+            config = load(self.start, "cpu").config
             if config.method != self.method:
                 got = f"weights of method {config.method}"
                 raise input_error("initial weights of another method", got=got, do="give --initial-part features")

@@ -21,6 +21,7 @@ import torch.distributed as distributed
 from nolbo_ppl._version import __version__
 from nolbo_ppl.data.converters.photographs import read_photographs
 from nolbo_ppl.data.loader import prefetch
+from nolbo_ppl.devices import device_of, placed
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.posterior.model_folder import load, save
 from nolbo_ppl.io.files import read_json_object, write_json
@@ -61,29 +62,35 @@ class TrainSummary:
 def run(config: TrainConfig) -> TrainSummary:
     """Train as configured; returns when the model is written.
 
+    Networks and batches are on the configured device; scenes are rendered, read and augmented on the CPU meanwhile.
+
     Raises:
         InputError: the configuration or the data cannot be used, or the folder holds a run of another configuration or
             something else, or another process writes into it.
     """
-    rank, world = _join()
+    device = device_of(config.device)
+    rank, world = _join(device)
     with run_folder(config.out) if rank == 0 else nullcontext():
-        return _run(config, rank, world)
+        return _run(config, rank, world, device)
 
 
-def _run(config: TrainConfig, rank: int, world: int) -> TrainSummary:
+def _run(config: TrainConfig, rank: int, world: int, device: torch.device) -> TrainSummary:
     started = time.perf_counter()
     if config.threads:
         torch.set_num_threads(config.threads)
-    data = TrainingData(config, rank, world)
+    data = TrainingData(config, rank, world, device)
     model = Nolbo.from_seed(data.model, config.seed)
     if config.start is not None:
-        initial = load(config.start).model
+        initial = load(config.start, "cpu").model
         if config.grow:
             initial = grow(initial, model.config, config.seed)
         if config.initial_part == "features":
             adopt_features(model, initial)
         else:
             adopt(model, initial, config.detector)
+    model.to(device)
+    if config.compile:
+        compile_networks(model)
     training_logger = TrainingLogger(config, rank)
     stages = config.stages()
     first, tensors, at_step = training_logger.resume(model, stages)
@@ -144,12 +151,12 @@ def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dic
         if file.is_file():  # a run that is resumed need not gather again
             return table_of(load_tensors(file)[0])
         batches = progress_bar(data.plain(held_out, config.evidence_scenes), "evidence", "batch")
-        table = join_tables(gather_table(guide, batch) for batch in batches)
+        table = join_tables(gather_table(guide, placed(batch, data.device)) for batch in batches)
         save_tensors(file, table_tensors(table), {})
         return table
 
     train, held_out = gathered(False), gathered(True)
-    terms = fit_fusion(model, train, held_out, data.plain_generated(config.evidence_scenes), config.seed)
+    terms = fit_fusion(model, train, held_out, data.plain_generated(config.evidence_scenes), config.seed)  # on the CPU
     return {f"evidence/{name}": value for name, value in terms.items()}
 
 
@@ -187,7 +194,7 @@ def _train_stage(
     with bar, batches if isinstance(batches, prefetch) else nullcontext():
         while not stage_run.finished:
             before = time.perf_counter()
-            batch = next(batches)
+            batch = placed(next(batches), data.device, non_blocking=True)
             waited += time.perf_counter() - before
             info = stage_run.step(batch)
             bar.update()
@@ -204,9 +211,17 @@ def _train_stage(
     return waited, time.perf_counter() - start - waited
 
 
-def _join() -> tuple[int, int]:
-    """Rank and number of processes; joins the group when `torchrun` started several."""
+def compile_networks(model: Nolbo) -> None:
+    """Let torch compile the encoder and the decoder, each anew for every shape of its input; weights keep their names."""
+    for part in (model.guide.encoder, model.story.decoder.layers):
+        part.compile()
+
+
+def _join(device: torch.device) -> tuple[int, int]:
+    """Rank and number of processes; joins the group when `torchrun` started several: NCCL on CUDA devices, else Gloo."""
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world > 1 and not distributed.is_initialized():
-        distributed.init_process_group("gloo")
+        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     return (distributed.get_rank(), world) if world > 1 else (0, 1)

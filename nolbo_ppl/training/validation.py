@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from nolbo_ppl._moved import renamed
+from nolbo_ppl.devices import placed
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SceneELBO
@@ -33,7 +34,9 @@ def validate(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
     sums: dict[str, float] = {}
     scenes = objects = left_out = 0
     found: dict[str, list[torch.Tensor]] = {name: [] for name in ("box50", "category", "error", "region")}
+    device = next(model.parameters()).device
     for batch in batches:
+        batch = placed(batch, device)
         scene = model.guide.observe(batch)
         scenes += len(batch.image)
         objects, left_out = objects + int(batch.present.sum()), left_out + int(scene.left_out.sum())
@@ -70,7 +73,7 @@ def _collect(model: Nolbo, scene: ObservedScene, found: dict[str, list[torch.Ten
     half = config.category_dim
     distance = (q.shape_loc[:, None, :half] - mean[:, :half]).square().sum(-1)
     found["category"].append((distance.argmin(-1) == batch.category[mask])[labelled])
-    plain = torch.tensor(config.symmetry)[batch.category[mask].clamp_min(0)] == 1
+    plain = torch.tensor(config.symmetry, device=mask.device)[batch.category[mask].clamp_min(0)] == 1
     use = labelled & plain & batch.has_viewpoint[mask]
     if bool(use.any()):
         posterior = orientation_posterior(q.map(lambda value: value[use]), config)

@@ -32,7 +32,7 @@ class DecodedShape(NamedTuple):
 
 def decode_latents(decoder: Decoder, latent: Float[Tensor, "n d"]) -> Float[np.ndarray, "n v v v"]:
     """Occupancy probability of each voxel for given latents, of which there must be some."""
-    return torch.cat([torch.sigmoid(decoder(part)) for part in latent.split(AT_ONCE)]).numpy()
+    return torch.cat([torch.sigmoid(decoder(part)) for part in latent.split(AT_ONCE)]).cpu().numpy()
 
 
 def sampled_shapes(
@@ -72,8 +72,8 @@ def sampled_shapes(
         decoded = torch.sigmoid(decoder(chunk.flatten(0, 1))).unflatten(0, chunk.shape[:2])
         middle = decoded[1:].mean(0)
         squares = (decoded[1:] - middle).square_().sum(0)  # torch.var_mean takes 20 times as long here
-        mean[part], variance[part] = middle.numpy(), (squares / (samples - 1)).numpy()
-        size[part] = extents(decoded[0].numpy()) * diagonal[part][:, None]
+        mean[part], variance[part] = middle.cpu().numpy(), (squares / (samples - 1)).cpu().numpy()
+        size[part] = extents(decoded[0].cpu().numpy()) * diagonal[part][:, None]
     return DecodedShape(mean, variance, size)
 
 

@@ -177,11 +177,14 @@ class FoldedNetworks:
     def _follow(self) -> None:
         """Make the networks, if any weight was written or replaced since they were made."""
         parts = [*self.model.guide.parameters(), *self.model.story.decoder.parameters(), *self.model.guide.buffers()]
+        if any(one.device.type != "cpu" for one in parts):
+            self._state, self._guide, self._decoder = None, self.model.guide, self.model.story.decoder
+            return
         state = tuple(hash((one.data_ptr(), 0 if one.is_inference() else one._version)) for one in parts)
         if state == self._state:
             return
         self._state = state
-        plain = any(one.is_floating_point() and (one.dtype != torch.float32 or one.device.type != "cpu") for one in parts)
+        plain = any(one.is_floating_point() and one.dtype != torch.float32 for one in parts)
         if plain or self.model.training:
             self._guide, self._decoder = self.model.guide, self.model.story.decoder
             return

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from nolbo_ppl.devices import device_of
 from nolbo_ppl.errors import InputError, input_error, located
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.single_object_predictor import SingleObjectModel
@@ -22,11 +23,18 @@ FORMAT = 1
 """Format of a model's files, kept beside the tensors: a file of a later one is refused, not misread."""
 
 
-def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
+def load(
+    name_or_path: str | PathLike[str] = "photo", device: str | torch.device = "auto", *, half_precision: bool = False
+) -> ObservationModel:
     """Load a model: the name of weights in the package (`photo`, `tiny`), or a folder with `model.safetensors` and `config.json`.
 
+    Args:
+        name_or_path: which.
+        device: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`; answers are the same within the tolerance of single precision.
+        half_precision: run the networks' convolutions and matrix products in bfloat16.
+
     Raises:
-        InputError: neither is there, or the files are damaged or do not fit each other.
+        InputError: neither is there, the files are damaged or do not fit each other, or there is no such device.
 
     Example:
         >>> import nolbo_ppl
@@ -34,6 +42,7 @@ def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
         >>> "car" in model.config.categories
         True
     """
+    target = device_of(device)
     shipped = Path(str(resources.files("nolbo_ppl"))) / "weights"
     folder = Path(name_or_path)
     if not (folder / "config.json").is_file():
@@ -61,8 +70,10 @@ def load(name_or_path: str | PathLike[str] = "photo") -> ObservationModel:
         check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
     model = Nolbo.from_seed(config, seed=0)
     load_strictly(model, tensors, weights)
+    model.set_half_precision(half_precision)
+    model.to(target)
     if config.description.one_object:  # the shipped scene network says where objects are
-        return SingleObjectModel(model, calibration, load("tiny"))
+        return SingleObjectModel(model, calibration, load("tiny", target, half_precision=half_precision))
     return ObservationModel(model, calibration)
 
 

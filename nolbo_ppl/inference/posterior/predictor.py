@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -12,6 +13,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from nolbo_ppl.devices import device_of
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import boxes_in_image, suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
@@ -54,8 +56,18 @@ class ObservationModel:
         self.model = model.eval().requires_grad_(False)
         self.calibration = calibration or Calibration()
         self.config = model.config
-        self._prior_mean = model.story.prior.label_mean().detach()
+        self._prior_mean = model.story.prior.label_mean().detach().cpu()
+        self._prior = model.story.prior if self.device.type == "cpu" else copy.deepcopy(model.story.prior).cpu()
         self._networks = FoldedNetworks(self.model)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks are; answers are arrays in the memory of the CPU, wherever they come from."""
+        return next(self.model.parameters()).device
+
+    def to(self, device: str | torch.device) -> ObservationModel:
+        """The same model on a device (`nolbo_ppl.devices.device_of`); the networks themselves are moved."""
+        return ObservationModel(self.model.to(device_of(device)), self.calibration)
 
     def prior_mean(self) -> Float[np.ndarray, "labels d"]:
         """mu_psi(l) of every category."""
@@ -64,18 +76,18 @@ class ObservationModel:
     @torch.inference_mode()
     def decode(self, latent: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n v v v"]:
         """Occupancy probability of each voxel of the canonical grid, for given shape latents."""
-        z = torch.as_tensor(np.asarray(latent), dtype=self._prior_mean.dtype)
+        z = torch.as_tensor(np.asarray(latent), dtype=self._prior_mean.dtype)  # moved where it is decoded
         if z.dim() != 2 or z.shape[1] != self.config.latent_dim:
             raise input_error("shape latents", got=tuple(z.shape), expected=f"(n, {self.config.latent_dim})")
         if len(z) == 0:
             return np.zeros((0,) + (self.config.voxel_size,) * 3, dtype=np.float32)
-        return decode_latents(self._networks.decoder, z)
+        return decode_latents(self._decoded, z)
 
     @torch.inference_mode()
     def shape_posterior(self, packed: UInt8[np.ndarray, "n bytes"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
         """Mean and scale of q(z | true shape) of packed voxel grids: the shape autoencoder's posterior."""
-        loc, scale = self.model.shape_guide.posterior(torch.as_tensor(packed))
-        return loc.numpy(), scale.numpy()
+        loc, scale = self.model.shape_guide.posterior(torch.as_tensor(packed).to(self.device))
+        return loc.cpu().numpy(), scale.cpu().numpy()
 
     def observe(
         self,
@@ -155,9 +167,10 @@ class ObservationModel:
 
         def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
             scaled = [checked[i] * np.tile(prepared[i].scale, 2) for i in group]
-            row = torch.repeat_interleave(torch.arange(len(group)), torch.tensor([len(part) for part in scaled]))
+            row = torch.from_numpy(np.repeat(np.arange(len(group)), [len(part) for part in scaled]))
             box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
-            region = self._networks.guide.responsible_region(encoding, row, box)
+            at = self.device
+            region = self._networks.guide.responsible_region(encoding, row.to(at), box.to(at)).cpu()
             return row, region, logit[row, region], box
 
         return self._observe(prepared, responsible, decode, samples, seed, batch)
@@ -165,7 +178,11 @@ class ObservationModel:
     @torch.inference_mode()
     def encode(self, image: UInt8[Tensor, "b 3 h w"]) -> Encoding:
         """The network's forward pass over a batch of prepared images."""
-        return self._networks.guide.encode(image)
+        return self._networks.guide.encode(image.to(self.device))
+
+    def _decoded(self, latent: Float[Tensor, "n d"]) -> Float[Tensor, "n v v v"]:
+        """Log odds of the voxels of latents."""
+        return self._networks.decoder(latent.to(self.device))
 
     @torch.inference_mode()
     def _observe(
@@ -177,19 +194,23 @@ class ObservationModel:
         seed: int,
         batch: int,
     ) -> list[ObjectPosteriors]:
-        """Run batches of images of one shape; `find` gives what to answer for."""
+        """Run batches of images of one shape; `find` gives what to answer for.
+
+        The networks run where they are. What is chosen of their output, a few numbers an object, is brought to the CPU and
+        answered there, in double precision where the formulas want it, which not every device has.
+        """
         shapes = self._shapes(decode, samples, seed)
         results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
             encoding = self.encode(torch.stack([prepared[i].image for i in group]))
-            logit = self.calibration.objectness(encoding.objectness_logit)
+            logit = self.calibration.objectness(encoding.objectness_logit.cpu())
             row, region, odds, look_at = find(encoding, logit, group)
             camera = torch.stack([prepared[i].camera for i in group])[row]
             scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
             regions = SelectedRegions(
                 self._parameters(encoding, row, region, look_at), region, encoding.columns, odds, camera, scale
             )
-            answer = assemble(regions, self.config, self.model.story.prior, self._prior_mean, shapes)
+            answer = assemble(regions, self.config, self._prior, self._prior_mean, shapes)
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
             for k, i in enumerate(group):
                 results[i] = answer[slice(ends[k], ends[k + 1])]
@@ -213,13 +234,16 @@ class ObservationModel:
     def _parameters(
         self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
     ) -> RegionParameters:
-        q = self._networks.guide.parameters_at(encoding, row, region, box=box)
+        at = self.device
+        look_at = None if box is None else box.to(at)
+        q = self._networks.guide.parameters_at(encoding, row.to(at), region.to(at), box=look_at).map(Tensor.cpu)
         return self.calibration.apply(q.at_map_category(self._prior_mean))
 
     def _boxes(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> Float[Tensor, "n 4"]:
         """Boxes of regions, px of the scaled image; no second look is needed for them."""
-        q = self._networks.guide.parameters_at(encoding, row, region, look=False)
-        return decode_box(q.box_loc, region // self.config.predictors, encoding.columns, self.config)
+        at = self.device
+        q = self._networks.guide.parameters_at(encoding, row.to(at), region.to(at), look=False)
+        return decode_box(q.box_loc.cpu(), region // self.config.predictors, encoding.columns, self.config)
 
     def _detections(
         self, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float
@@ -238,7 +262,7 @@ class ObservationModel:
         kept, stands_for = suppress(box, logit[row, region], iou_threshold, group=row)
         probability = torch.sigmoid(logit[row, region].double())
         if not self.config.detector:
-            probability = torch.zeros(len(row), dtype=torch.float64).index_add_(0, stands_for, probability)
+            probability = torch.zeros_like(probability).index_add_(0, stands_for, probability)
         probability = probability.clamp(max=1 - 1e-6)
         kept = kept[probability[kept] > threshold]
         kept = kept[torch.argsort(probability[kept], descending=True, stable=True)]

@@ -57,7 +57,7 @@ def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torc
         InputError: no image, a tiny one, or intrinsics of no camera.
     """
     if isinstance(image, Tensor):
-        image = image.permute(1, 2, 0).numpy() if image.dim() == 3 else image.numpy()
+        image = (image.permute(1, 2, 0) if image.dim() == 3 else image).cpu().numpy()
     if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         got = (getattr(image, "shape", type(image).__name__), getattr(image, "dtype", ""))
         raise input_error("an image", got=got, expected="a uint8 array of shape (height, width, 3)")
