@@ -28,8 +28,20 @@ MOVES = {aten._to_copy.default, aten.copy_.default}
 FACTORIES = {
     getattr(torch, name)
     for name in (
-        "zeros", "ones", "empty", "full", "arange", "linspace", "eye", "rand", "randn", "randint", "randperm", "tensor", "as_tensor",
-    )  # fmt: skip
+        "zeros",
+        "ones",
+        "empty",
+        "full",
+        "arange",
+        "linspace",
+        "eye",
+        "rand",
+        "randn",
+        "randint",
+        "randperm",
+        "tensor",
+        "as_tensor",
+    )
 }
 
 

@@ -195,7 +195,10 @@ def test_observe_answers_as_on_the_cpu(name: str) -> None:
     model = model_of(name)
     with fake_device():
         device_model = ObservationModel(model).to(FAKE)
-        again, boxed = device_model.observe(pictures(), camera, threshold=0.005), device_model.observe_boxes(pictures(), camera, boxes)
+        again, boxed = (
+            device_model.observe(pictures(), camera, threshold=0.005),
+            device_model.observe_boxes(pictures(), camera, boxes),
+        )
         shape = device_model.decode(device_model.prior_mean()[:2])
     assert device_model.device == FAKE
     for a, b in zip([*found, *at_boxes], [*again, *boxed]):

@@ -183,7 +183,9 @@ def module_tensors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 def restore(state: OptimizerState, tensors: dict[str, Tensor], at_step: int) -> OptimizerState:
     """Put a state back to what `state_tensors` saved, bit for bit."""
     state.module.load_state_dict(module_tensors(tensors))
-    state.average = {name: value.to(state.average[name].device, copy=True) for name, value in part_of(tensors, "average/").items()}
+    state.average = {
+        name: value.to(state.average[name].device, copy=True) for name, value in part_of(tensors, "average/").items()
+    }
     restore_optimizer(state.optimizer, part_of(tensors, "optimizer/"), dict(state.module.named_parameters()))
     state.step = at_step
     return state

@@ -141,7 +141,9 @@ class Guide(nn.Module):
             predictor, assigned = assign_predictors(cell, iou, batch.present)
             region = cell * self.config.predictors + predictor
             regions = encoding.objectness_logit.shape[1]
-            is_object = torch.zeros(len(cell), regions + 1, dtype=torch.bool, device=cell.device)  # the last column takes the rest
+            is_object = torch.zeros(
+                len(cell), regions + 1, dtype=torch.bool, device=cell.device
+            )  # the last column takes the rest
             is_object.scatter_(1, torch.where(assigned, region, regions), True)
             has_range = batch.has_position & batch.has_size
             assignment = Assignment(
