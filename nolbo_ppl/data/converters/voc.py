@@ -33,7 +33,8 @@ def known_category(name: str, categories: Collection[str]) -> str | None:
     return None
 
 
-def _parse(file: Path) -> ElementTree.Element:
+def parse_annotation(file: Path) -> ElementTree.Element:
+    """Root of an XML file. Raises `InputError` naming the file where it is missing, large, or no plain XML."""
     if not file.is_file():
         raise input_error("no such annotation", file=file)
     if file.stat().st_size > MOST_BYTES:
@@ -78,7 +79,7 @@ def read_voc_annotation(
         InputError: names the file and the field.
     """
     file = Path(path)
-    root = _parse(file)
+    root = parse_annotation(file)
     name = root.findtext("filename")
     if not name:
         raise input_error("filename", got=repr(name), expected="the name of the image", file=file)

@@ -19,6 +19,7 @@ from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
 from nolbo_ppl.synthetic.assets.obj_file import read_obj
+from nolbo_ppl.synthetic.assets.off_file import read_off
 from nolbo_ppl.synthetic.shapes.canonical_shape import Shape
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
@@ -95,6 +96,16 @@ def load_cad_folder(
     return shapes
 
 
+def load_mesh(file: Path, up: str | None = None, front: str | None = None) -> tuple[Vertices, Faces]:
+    """One mesh turned to the canonical frame (front to -y, z up), neither centred nor scaled.
+
+    Raises:
+        InputError: it is unreadable; names the file.
+    """
+    vertices, faces = _read_mesh(file)
+    return vertices @ axis_rotation(*axes_of(file.suffix.lower(), up, front)).T, faces
+
+
 def axes_of(suffix: str, up: str | None = None, front: str | None = None) -> tuple[str, str]:
     """Up and front of files of this ending: what is asked for, else what their format fixes.
 
@@ -169,6 +180,8 @@ def _read_mesh(file: Path) -> tuple[Vertices, Faces]:
     """Read one mesh; the parts of a scene are joined in their places. Raises `InputError` naming the file."""
     if file.suffix.lower() == ".obj":
         return read_obj(file)
+    if file.suffix.lower() == ".off":
+        return read_off(file)
     import trimesh  # delayed: heavy to import
 
     try:
