@@ -5,7 +5,8 @@
 
 Batches are random pixels with labelled boxes, made once: neither rendering nor reading is measured. Each figure is the median
 over repeated steps after a warm-up, with their quartiles. The numbers are compared in single precision without TF32: terms of
-the loss of one step, and everything that `observe_boxes` answers, against the same networks on the CPU.
+the loss of one step, and everything that `observe_boxes` answers, against the same networks in double precision on the CPU. (A
+CPU itself answers queries with kernels in bfloat16 where it multiplies matrices of it; there the answers differ more.)
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.elbo import INCLUSIVE
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
-from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.io.files import write_json
 from nolbo_ppl.models.model_config import PRESETS, ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
@@ -36,7 +37,7 @@ from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.training.stages import StageRun, TrainingStage
 from nolbo_ppl.training.trainer import compile_networks
 
-TOLERANCE = 2e-3
+TOLERANCE = {"cuda": 2e-3, "mps": 2e-3, "cpu": 0.1}
 """Largest relative difference of a term, and largest difference of an answer over its own spread, that counts as equal."""
 
 
@@ -125,7 +126,7 @@ def fresh(name: str, config: ModelConfig) -> Nolbo:
 def stage_of(decode: int) -> TrainingStage:
     """A step on scenes, some objects decoded."""
     return TrainingStage(
-        "scenes", OptimisationConfig(100, optimizer="muon", warmup=0), {**INCLUSIVE, "voxels": 0.002}, decode=decode
+        "scenes", OptimizerConfig(100, optimizer="muon", warmup=0), {**INCLUSIVE, "voxels": 0.002}, decode=decode
     )
 
 
@@ -174,11 +175,11 @@ def compare(name: str, size: int, device: torch.device) -> dict[str, Any]:
     config = PRESETS[name]()
     terms, answers = [], []
     scenes = random_scenes(config, 1, size)
-    for where in (torch.device("cpu"), device):
-        model = fresh(name, config).to(where)
+    for where, dtype in ((torch.device("cpu"), torch.float64), (device, torch.float32)):
+        model = fresh(name, config).to(where, dtype)
         run = StageRun(model, stage_of(4), half_precision=False)
-        terms.append(run.step(placed(scenes, where)).terms)
-        observer = ObservationModel(fresh(name, config)).to(where)
+        terms.append(run.step(placed(scenes.to(dtype), where)).terms)
+        observer = ObservationModel(fresh(name, config).to(where, dtype))
         found = observer.observe_boxes(list(scenes.image), scenes.intrinsics.numpy(), list(scenes.box.numpy()), size=size)[0]
         answers.append({f.name: getattr(found, f.name) for f in dataclasses.fields(found)})
     term = max(abs(terms[1][key] - value) / max(abs(value), 1e-3) for key, value in terms[0].items())
@@ -188,8 +189,8 @@ def compare(name: str, size: int, device: torch.device) -> dict[str, Any]:
         for key, value in spread.items()
         if value.size
     )
-    equal = term < TOLERANCE and answer < TOLERANCE
-    return {"preset": name, "size": size, "terms": term, "answers": answer, "equal": equal, "same_device": device.type == "cpu"}
+    equal = term < TOLERANCE["cuda"] and answer < TOLERANCE[device.type]
+    return {"preset": name, "size": size, "terms": term, "answers": answer, "equal": equal}
 
 
 def main(settings: Settings) -> dict[str, Any]:
@@ -224,8 +225,9 @@ def main(settings: Settings) -> dict[str, Any]:
             show(row)
         equal.append(compare(name, sizes[0], device))
     for one in equal:
-        said = "the same device" if one["same_device"] else "equal" if one["equal"] else "DIFFERENT"
-        print(f"{one['preset']}: terms differ by {one['terms']:.1e}, answers by {one['answers']:.1e} from the CPU's: {said}")
+        said = "equal" if one["equal"] else "DIFFERENT"
+        differ = f"terms differ by {one['terms']:.1e}, answers by {one['answers']:.1e}"
+        print(f"{one['preset']}: {differ} from float64 on the CPU: {said}")
     figures |= {"rows": rows, "equality": equal}
     if settings.out is not None:
         write_json(settings.out, figures)

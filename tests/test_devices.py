@@ -15,7 +15,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference import svi
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SHAPE_STAGE, SceneELBO, SceneLoss
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
-from nolbo_ppl.inference.svi import OptimisationConfig
+from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.prior_predictive import prior_predictive
@@ -25,7 +25,7 @@ from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.training.calibrate import calibrate
 from nolbo_ppl.training.evidence_fit import gather_table
 from nolbo_ppl.training.stages import StageRun, TrainingStage
-from nolbo_ppl.training.validation import held_out
+from nolbo_ppl.training.validation import validate
 from tests.factories import instance_config, random_batch, tiny_config, tiny_model
 from tests.fake_device import FAKE, Held, ImplicitDevice, fake_device
 
@@ -141,7 +141,7 @@ def test_bound_and_step_are_those_of_the_cpu(name: str, weights: dict[str, float
         batch = partly_labelled(model.config)
         if fake:
             model, batch = on_fake(model, batch)
-        stage = TrainingStage("scenes", OptimisationConfig(2, optimizer="muon", warmup=0), weights, decode=2)
+        stage = TrainingStage("scenes", OptimizerConfig(2, optimizer="muon", warmup=0), weights, decode=2)
         if fake:
             with fake_device():
                 run = StageRun(model, stage)
@@ -164,7 +164,7 @@ def test_shapes_are_learnt_there_too() -> None:
     model = model_of("instances")
     scenes = random_batch(model.config, scenes=2, slots=4)
     batch = ShapeBatch(scenes.voxels.flatten(0, 1), scenes.category.flatten(), scenes.instance.flatten(), torch.randn(8, 4))
-    stage = TrainingStage("shapes", OptimisationConfig(1), SHAPE_STAGE)
+    stage = TrainingStage("shapes", OptimizerConfig(1), SHAPE_STAGE)
     expected = StageRun(model_of("instances"), stage).step(batch)
     model, batch = on_fake(model, batch)
     with fake_device():
@@ -208,13 +208,13 @@ def test_observe_answers_as_on_the_cpu(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["mixture", "hybrid"])
 def test_validation_calibration_and_evidence(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nolbo_ppl.training.calibrate.LEAST_OBJECTS", 5)
+    monkeypatch.setattr("nolbo_ppl.training.calibrate.MIN_OBJECTS", 5)
     batches = [random_batch(CONFIGS[name](), scenes=3, slots=3, seed=s) for s in (1, 2)]
-    expected = held_out(model_of(name), batches), calibrate(model_of(name), batches)
+    expected = validate(model_of(name), batches), calibrate(model_of(name), batches)
     model = model_of(name)
     with fake_device():
         model.to(FAKE)
-        found = held_out(model, batches), calibrate(model, batches)
+        found = validate(model, batches), calibrate(model, batches)
         table = gather_table(model.guide, placed(batches[0], FAKE)) if name == "hybrid" else None  # type: ignore[arg-type]
     assert found[0] == pytest.approx(expected[0], rel=1e-7)
     assert dataclasses.astuple(found[1]) == pytest.approx(dataclasses.astuple(expected[1]), rel=1e-6)
@@ -240,7 +240,7 @@ def test_sceneloss_without_terms_lies_with_the_parameters() -> None:
 def test_a_gpu_gives_the_numbers_of_the_cpu(name: str, tmp_path: Path) -> None:
     device = device_of("cuda")
     batch = partly_labelled(CONFIGS[name]())
-    stage = TrainingStage("scenes", OptimisationConfig(1, optimizer="muon", warmup=0), INCLUSIVE, decode=2)
+    stage = TrainingStage("scenes", OptimizerConfig(1, optimizer="muon", warmup=0), INCLUSIVE, decode=2)
     expected = StageRun(model_of(name), stage).step(batch)
     found = StageRun(model_of(name).to(device), stage).step(placed(pinned(batch, device), device))
     assert found.terms == pytest.approx(expected.terms, rel=1e-6)

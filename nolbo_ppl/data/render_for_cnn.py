@@ -19,12 +19,14 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.images import list_images, open_image
 
 SYNSETS = {
-    "02691156": "aeroplane", "02834778": "bicycle", "02858304": "boat", "02876657": "bottle", "02924116": "bus", "02958343": "car",
-    "03001627": "chair", "04379243": "diningtable", "03790512": "motorbike", "04256520": "sofa", "04468005": "train",
-    "03211117": "tvmonitor",
+    "02691156": "aeroplane", "02834778": "bicycle", "02858304": "boat", "02876657": "bottle", "02924116": "bus",
+    "02958343": "car", "03001627": "chair", "04379243": "diningtable", "03790512": "motorbike", "04256520": "sofa",
+    "04468005": "train", "03211117": "tvmonitor",
 }  # fmt: skip
 """Category of each of the twelve synsets of ShapeNet that are rendered."""
-NAME = re.compile(r"(?P<synset>\d{8})_(?P<shape>.+)_a(?P<azimuth>-?\d+)_e(?P<elevation>-?\d+)_t(?P<theta>-?\d+)_d(?P<distance>-?\d+)")
+NAME = re.compile(
+    r"(?P<synset>\d{8})_(?P<shape>.+)_a(?P<azimuth>-?\d+)_e(?P<elevation>-?\d+)_t(?P<theta>-?\d+)_d(?P<distance>-?\d+)"
+)
 HELD_OUT = 20
 """A shape in so many is held out: the archive has no split, and views of one shape must not be on both sides."""
 
@@ -40,7 +42,11 @@ class RenderedViewpoints:
     """
 
     def __init__(
-        self, files: Sequence[Path], category: Int[np.ndarray, " n"], viewpoint: Float[np.ndarray, "n 3"], categories: Sequence[str]
+        self,
+        files: Sequence[Path],
+        category: Int[np.ndarray, " n"],
+        viewpoint: Float[np.ndarray, "n 3"],
+        categories: Sequence[str],
     ) -> None:
         self.files, self.category, self.viewpoint = tuple(files), category, viewpoint
         self.categories = tuple(categories)
@@ -68,13 +74,17 @@ def viewpoint_of_name(file: Path) -> tuple[str, str, tuple[float, float, float]]
     """
     match = NAME.fullmatch(file.stem)
     if match is None:
-        raise input_error("name of a rendered picture", got=file.name, expected="SYNSET_SHAPE_aAZIMUTH_eELEVATION_tTHETA_dDISTANCE", file=file)
+        raise input_error(
+            "name of a rendered picture", got=file.name, expected="SYNSET_SHAPE_aAZIMUTH_eELEVATION_tTHETA_dDISTANCE", file=file
+        )
     if match["synset"] not in SYNSETS:
         raise input_error("synset of a rendered picture", got=match["synset"], expected=f"one of {sorted(SYNSETS)}", file=file)
     azimuth, elevation, theta = (int(match[name]) for name in ("azimuth", "elevation", "theta"))
     if abs(elevation) > 90 or abs(azimuth) > 360 or abs(theta) > 360:
         got = f"a{azimuth} e{elevation} t{theta}"
-        raise input_error("angles of a rendered picture", got=got, expected="azimuth and theta within 360, elevation within 90", file=file)
+        raise input_error(
+            "angles of a rendered picture", got=got, expected="azimuth and theta within 360, elevation within 90", file=file
+        )
     turn = np.radians([azimuth, elevation, theta])
     turn[[0, 2]] = np.arctan2(np.sin(turn[[0, 2]]), np.cos(turn[[0, 2]]))
     return SYNSETS[match["synset"]], match["shape"], (float(turn[0]), float(turn[1]), float(turn[2]))
@@ -83,7 +93,7 @@ def viewpoint_of_name(file: Path) -> tuple[str, str, tuple[float, float, float]]
 def open_render_for_cnn(
     root: str | PathLike[str], held_out: bool = False, categories: Sequence[str] = tuple(sorted(SYNSETS.values()))
 ) -> RenderedViewpoints:
-    """Pictures of a folder and of the folders in it; every twentieth shape of a category, in the order of their names, is held out.
+    """Pictures of a folder and those in it; every twentieth shape of a category, in the order of their names, is held out.
 
     Raises:
         InputError: no picture, or one whose name states no viewpoint (names it).

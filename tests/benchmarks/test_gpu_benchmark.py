@@ -35,7 +35,7 @@ def test_it_runs_on_the_cpu(gpu: ModuleType, tmp_path: Path, capsys: pytest.Capt
     kinds = [row["what"] for row in figures["rows"]]
     assert kinds == ["training step", "observe", "observe 4 boxes"]
     assert all(row["seconds"] > 0 and row["repetitions"] >= 2 for row in figures["rows"]) and figures["rows"][0]["memory_gb"] > 0
-    assert figures["equality"][0]["equal"] and figures["equality"][0]["terms"] == 0 and "nano" in capsys.readouterr().out
+    assert figures["equality"][0]["equal"] and 0 < figures["equality"][0]["terms"] < 1e-3 and "nano" in capsys.readouterr().out
 
 
 def test_it_sees_a_difference(gpu: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,7 +46,7 @@ def test_it_sees_a_difference(gpu: ModuleType, monkeypatch: pytest.MonkeyPatch) 
         calls.append(name)
         if len(calls) > 2:  # the second device's networks
             with torch.no_grad():
-                model.guide.head.objectness.bias += 0.1
+                model.guide.head.objectness.bias += 1.0
         return model
 
     monkeypatch.setattr(gpu, "fresh", other)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 
@@ -61,5 +62,5 @@ def _triangles(rows: list[list[str]], vertices: int, file: Path) -> Int[np.ndarr
         if count < 0 or len(corners) != count or any(not 0 <= corner < vertices for corner in corners):
             got, expected = " ".join(words[:6]), f"a count and as many corners of 0 to {vertices - 1}"
             raise input_error(f"face {number} of an OFF file", got=got, expected=expected, file=file)
-        found += [(corners[0], a, b) for a, b in zip(corners[1:], corners[2:])]
+        found += [(corners[0], a, b) for a, b in pairwise(corners[1:])]
     return np.array(found, dtype=np.int64).reshape(-1, 3)
