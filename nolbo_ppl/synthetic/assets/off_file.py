@@ -30,7 +30,9 @@ def read_off(path: str | PathLike[str]) -> tuple[Float[np.ndarray, "v 3"], Int[n
     lines = [words for words in lines if words]
     match = re.fullmatch(r"(?:ST)?C?N?OFF(.*)", lines[0][0], re.IGNORECASE) if lines else None
     if match is None:
-        raise input_error("header of an OFF file", got=" ".join(lines[0][:3]) if lines else "nothing", expected="OFF", file=file)
+        raise input_error(
+            "unreadable CAD file: header", got=" ".join(lines[0][:3]) if lines else "nothing", expected="OFF", file=file
+        )
     rest = [word for word in (match[1], *lines[0][1:]) if word]
     body = lines[1:]
     if not rest and body:
@@ -39,14 +41,14 @@ def read_off(path: str | PathLike[str]) -> tuple[Float[np.ndarray, "v 3"], Int[n
         vertices, faces = (int(word) for word in rest[:2])
     except ValueError:
         got = " ".join(rest[:3]) or "nothing"
-        raise input_error("counts of an OFF file", got=got, expected="vertices faces edges", file=file) from None
+        raise input_error("unreadable CAD file: counts", got=got, expected="vertices faces edges", file=file) from None
     if not 0 <= vertices <= LARGEST or not 0 <= faces <= LARGEST or vertices + faces > len(body):
         got = f"{vertices} vertices and {faces} faces in {len(body)} lines"
-        raise input_error("counts of an OFF file", got=got, expected="a line for each", do="is it truncated?", file=file)
+        raise input_error("unreadable CAD file: counts", got=got, expected="a line for each", do="is it truncated?", file=file)
     try:
         points = np.array([[float(word) for word in words[:3]] for words in body[:vertices]], dtype=np.float64).reshape(-1, 3)
     except ValueError as error:
-        raise input_error("vertices of an OFF file", got=error, expected="three numbers a line", file=file) from None
+        raise input_error("unreadable CAD file: vertices", got=error, expected="three numbers a line", file=file) from None
     return points, _triangles(body[vertices : vertices + faces], vertices, file)
 
 
@@ -61,6 +63,6 @@ def _triangles(rows: list[list[str]], vertices: int, file: Path) -> Int[np.ndarr
             corners, count = [], -1
         if count < 0 or len(corners) != count or any(not 0 <= corner < vertices for corner in corners):
             got, expected = " ".join(words[:6]), f"a count and as many corners of 0 to {vertices - 1}"
-            raise input_error(f"face {number} of an OFF file", got=got, expected=expected, file=file)
+            raise input_error(f"unreadable CAD file: face {number}", got=got, expected=expected, file=file)
         found += [(corners[0], a, b) for a, b in pairwise(corners[1:])]
     return np.array(found, dtype=np.int64).reshape(-1, 3)
