@@ -15,6 +15,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference import svi
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SHAPE_STAGE, SceneELBO, SceneLoss
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.inference.posterior.single_object_predictor import SingleObjectModel
 from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
@@ -24,7 +25,7 @@ from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.training.calibrate import calibrate
 from nolbo_ppl.training.evidence_fit import gather_table
-from nolbo_ppl.training.stages import StageRun, TrainingStage
+from nolbo_ppl.training.stages import StageRun, TrainingStage, scene_weights
 from nolbo_ppl.training.validation import validate
 from tests.factories import instance_config, random_batch, tiny_config, tiny_model
 from tests.fake_device import FAKE, Held, ImplicitDevice, fake_device
@@ -40,6 +41,8 @@ CONFIGS = {
     "sincos": lambda: tiny_config(orientation="sincos"),
     "instances": instance_config,
     "hybrid": hybrid_config,
+    "single": lambda: tiny_config(method="single"),
+    "vaegan": lambda: tiny_config(method="vaegan"),
 }
 
 
@@ -141,6 +144,7 @@ def test_bound_and_step_are_those_of_the_cpu(name: str, weights: dict[str, float
         batch = partly_labelled(model.config)
         if fake:
             model, batch = on_fake(model, batch)
+        weights = scene_weights("inclusive", method=model.config.method) if weights is INCLUSIVE else weights
         stage = TrainingStage("scenes", OptimizerConfig(2, optimizer="muon", warmup=0), weights, decode=2)
         if fake:
             with fake_device():
@@ -172,6 +176,12 @@ def test_shapes_are_learnt_there_too() -> None:
     assert found.terms == pytest.approx(expected.terms, rel=1e-9)
 
 
+def observer(name: str) -> ObservationModel:
+    if name == "single":
+        return SingleObjectModel(model_of(name), None, ObservationModel(model_of("mixture")))
+    return ObservationModel(model_of(name))
+
+
 def pictures() -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     return [rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) for _ in range(2)]
@@ -184,17 +194,17 @@ def same_answer(a: ObjectPosteriors, b: ObjectPosteriors) -> None:
             np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-9, err_msg=field.name)
 
 
-@pytest.mark.parametrize("name", ["mixture", "instances", "hybrid"])
+@pytest.mark.parametrize("name", ["mixture", "instances", "hybrid", "single"])
 def test_observe_answers_as_on_the_cpu(name: str) -> None:
     boxes = [np.array([[5.0, 5.0, 40.0, 30.0], [20.0, 10.0, 60.0, 60.0]]), np.zeros((0, 4))]
     camera = [60.0, 60.0, 32.0, 32.0]
-    expected = ObservationModel(model_of(name))
+    expected = observer(name)
     found = expected.observe(pictures(), camera, threshold=0.005)
     at_boxes = expected.observe_boxes(pictures(), camera, boxes)
     assert sum(map(len, found)) > 3
-    model = model_of(name)
+    device_model = observer(name)
     with fake_device():
-        device_model = ObservationModel(model).to(FAKE)
+        device_model = device_model.to(FAKE)
         again, boxed = (
             device_model.observe(pictures(), camera, threshold=0.005),
             device_model.observe_boxes(pictures(), camera, boxes),

@@ -78,7 +78,7 @@ class AdversarialLoss(nn.Module):
         voxels = unpack_bits(packed, self.config.voxel_size).to(dtype)
         terms = adversarial_terms(self.discriminator, self.decoder, voxels, noise.to(dtype))
         terms = {name: share * value for name, value in terms.items()}
-        added = sum((self.weights.get(name, 0.0) * value for name, value in terms.items()), torch.zeros((), dtype=dtype))
+        added = torch.stack([self.weights.get(name, 0.0) * value for name, value in terms.items()]).sum()
         return ElboResult({**result.terms, **terms}, result.loss - added / scenes)
 
 
@@ -93,7 +93,7 @@ def _true_shapes(batch: SceneBatch | ShapeBatch, decode: int | None) -> tuple[Te
     total = len(known)
     if decode is not None and total > decode:
         order = batch.decode_order
-        rank = torch.rand(total) if order is None else order.flatten()[known]
+        rank = torch.rand(total, device=known.device) if order is None else order.flatten()[known]
         known = known[rank.argsort(stable=True)[:decode]]
     packed = batch.voxels.flatten(0, 1)[known]
     noise = None if batch.noise is None else batch.noise.flatten(0, 1)[known]

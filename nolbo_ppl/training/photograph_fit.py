@@ -75,7 +75,7 @@ def find_objects(model: Nolbo, photos: Sequence[Photograph], batch: int = 16) ->
     parts: list[list[np.ndarray]] = []
     try:
         for share in (0.0, 1.0):
-            guide.fusion.photograph.copy_(torch.tensor([1.0, 0.0, 1.0, share]))
+            guide.fusion.photograph.copy_(torch.tensor([1.0, 0.0, 1.0, share], device="cpu"))
             observer = ObservationModel(model)
             found = []
             for first in progress_bar(range(0, len(photos), batch), "photographs to fit", "batch"):
@@ -158,7 +158,7 @@ def adopt_fit(model: Nolbo, fit: PhotographFit) -> None:
     guide = model.guide
     assert isinstance(guide, HybridGuide)
     numbers = [fit.factor, fit.shift, fit.label_factor, fit.look_share]
-    guide.fusion.photograph.copy_(torch.tensor(numbers, dtype=guide.fusion.photograph.dtype))
+    guide.fusion.photograph.copy_(torch.tensor(numbers, device="cpu", dtype=guide.fusion.photograph.dtype))
 
 
 def _not_to_be_found(photo: Photograph) -> Bool[np.ndarray, " m"]:

@@ -223,8 +223,8 @@ class ObservationModel:
             metres = diagonal.numpy()
             if not decode:
                 return DecodedShape(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
-            decoder, side = self._networks.decoder, self.config.voxel_size
-            return sampled_shapes(decoder, side, q.shape_loc, q.shape_scale, metres, samples, seed)
+            side = self.config.voxel_size
+            return sampled_shapes(self._decoded, side, q.shape_loc, q.shape_scale, metres, samples, seed)
 
         return shapes
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nolbo_ppl.devices import device_of
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import boxes_in_image
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
@@ -34,6 +35,11 @@ class SingleObjectModel(ObservationModel):
     def __init__(self, model: Nolbo, calibration: Calibration | None, detector: ObservationModel) -> None:
         super().__init__(model, calibration)
         self.detector = detector
+
+    def to(self, device: str | torch.device) -> SingleObjectModel:
+        """The same model, and its detector, on a device; see `ObservationModel.to`."""
+        target = device_of(device)
+        return SingleObjectModel(self.model.to(target), self.calibration, self.detector.to(target))
 
     def observe(
         self,
@@ -93,19 +99,22 @@ class SingleObjectModel(ObservationModel):
         results = []
         dtype, side = self._prior_mean.dtype, self.config.image_size
         for i, (image, given, certainty) in enumerate(zip(images, boxes, objectness)):
-            pixels = image if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
+            pixels = (
+                image.cpu() if isinstance(image, Tensor) else torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
+            )
             camera = intrinsics_of(intrinsics, i, len(images))
             camera = guessed_intrinsics(pixels.permute(1, 2, 0).numpy()) if camera is None else camera
             box = torch.as_tensor(np.asarray(given).reshape(-1, 4), dtype=dtype)
-            row = torch.zeros(len(box), dtype=torch.long)
+            row = torch.zeros(len(box), dtype=torch.long, device="cpu")
             crops = crop_objects(pixels[None].to(dtype), row, box, side)
             parts = []
             for first in range(0, max(len(box), 1), 4 * batch):
                 part = slice(first, first + 4 * batch)
-                rows = torch.arange(len(box[part]))
+                rows = torch.arange(len(box[part]), device="cpu")
                 encoding = self.encode(crops.image[part] if len(box) else pixels.new_zeros((1, 3, side, side)))
                 local = crops.into(box)[part]
-                region = self._networks.guide.responsible_region(encoding, rows, local)
+                at = self.device
+                region = self._networks.guide.responsible_region(encoding, rows.to(at), local.to(at)).cpu()
                 cameras = crops.camera(torch.as_tensor(camera, dtype=dtype).expand(len(box), 4))[part]
                 probability = torch.as_tensor(np.asarray(certainty), dtype=torch.float64)[part].clamp(1e-6, 1 - 1e-6)
                 selected = SelectedRegions(
@@ -117,7 +126,7 @@ class SingleObjectModel(ObservationModel):
                     np.ones((len(rows), 2)),
                 )
                 shapes = self._shapes(decode, samples, seed)
-                parts.append(assemble(selected, self.config, self.model.story.prior, self._prior_mean, shapes))
+                parts.append(assemble(selected, self.config, self._prior, self._prior_mean, shapes))
             answer = _joined(parts)
             back = crops.back(torch.as_tensor(answer.box, dtype=dtype)).numpy()
             scale = answer.box_scale / np.concatenate([crops.factor.numpy()[:, None].repeat(2, 1), np.ones((len(back), 2))], 1)

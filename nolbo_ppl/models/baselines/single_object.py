@@ -79,7 +79,7 @@ def one_object_batch(batch: SceneBatch, side: int, jitter: Float[Tensor, "b 4"] 
     extent = batch.box[..., 2:] - batch.box[..., :2]
     order = batch.decode_order if batch.decode_order is not None else -extent.prod(-1)
     slot = torch.where(batch.present, order.to(batch.box.dtype), torch.inf).argmin(1)
-    row = torch.arange(len(slot))
+    row = torch.arange(len(slot), device=slot.device)
 
     def chosen(value: Tensor | None) -> Any:
         return None if value is None else value[row, slot][:, None]
