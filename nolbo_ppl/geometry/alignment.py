@@ -60,7 +60,8 @@ def pose_alignment(
 
 def known_rows(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, " n"]:
     """Rows of a trajectory that hold a pose: rows of nothing but NaN are not known."""
-    return ~np.isnan(T).all(axis=(1, 2))
+    known: np.ndarray = ~np.isnan(T).all(axis=(1, 2))
+    return known
 
 
 def validated(T_estimate: np.ndarray, T_truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -99,7 +100,8 @@ def align(
         return T_estimate
     if alignment == "origin":
         first = int(np.argmax(both))
-        return (T_truth[first] @ inverse(T_estimate[first])) @ T_estimate
+        aligned: np.ndarray = (T_truth[first] @ inverse(T_estimate[first])) @ T_estimate
+        return aligned
     if alignment not in ("se3", "sim3", "pose"):
         raise input_error("unknown alignment", got=alignment, expected="none, origin, se3, sim3 or pose")
     if alignment == "pose":

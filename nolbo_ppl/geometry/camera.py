@@ -20,4 +20,5 @@ def pixel_ray(pixels: Float[Tensor, "*#batch 2"], intrinsics: Float[Tensor, "*#b
     """Unit direction, in the camera frame, of the ray through each pixel."""
     slope = (pixels - intrinsics[..., 2:]) / intrinsics[..., :2]
     ray = torch.cat((slope, torch.ones_like(slope[..., :1])), dim=-1)
-    return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+    unit: torch.Tensor = ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
+    return unit

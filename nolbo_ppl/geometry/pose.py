@@ -26,7 +26,8 @@ def so3_exp(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
     a = np.where(small, 1.0 - square / 6.0, np.sin(safe) / safe)[..., None, None]
     b = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2)[..., None, None]
     cross = skew(vector)
-    return np.eye(3) + a * cross + b * (cross @ cross)
+    R: np.ndarray = np.eye(3) + a * cross + b * (cross @ cross)
+    return R
 
 
 def so3_log(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "... 3"]:
@@ -76,7 +77,8 @@ def matrix_to_quaternion(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "
     best = np.argmax(np.stack([K[..., i, i] for i in range(4)], axis=-1), axis=-1)
     q = np.take_along_axis(K, best[..., None, None], axis=-1)[..., 0]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., 3:] < 0, -q, q)
+    standard: np.ndarray = np.where(q[..., 3:] < 0, -q, q)
+    return standard
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "... 3 3"]:
@@ -84,13 +86,15 @@ def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
     U, _, Vt = np.linalg.svd(matrix)
     U = U.copy()
     U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
-    return U @ Vt
+    R: np.ndarray = U @ Vt
+    return R
 
 
 def is_rotation(matrix: Float[np.ndarray, "... 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, ...]:
     """Whether each matrix is orthonormal with determinant +1, within `tolerance` an entry."""
     residual = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max(axis=(-2, -1))
-    return (residual < tolerance) & (np.linalg.det(matrix) > 0)
+    proper: np.ndarray = (residual < tolerance) & (np.linalg.det(matrix) > 0)
+    return proper
 
 
 def make_pose(R: Float[np.ndarray, "... 3 3"], position: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4 4"]:
@@ -109,12 +113,14 @@ def inverse(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 4 4"]:
 
 def relative(T_world_a: Float[np.ndarray, "... 4 4"], T_world_b: Float[np.ndarray, "... 4 4"]) -> np.ndarray:
     """`T_a_b`, pose of b in a (GTSAM's `between`)."""
-    return inverse(T_world_a) @ T_world_b
+    T_a_b: np.ndarray = inverse(T_world_a) @ T_world_b
+    return T_a_b
 
 
 def transform(T_a_b: Float[np.ndarray, "... 4 4"], points_b: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
     """Points of frame b in frame a."""
-    return np.einsum("...ij,...j->...i", T_a_b[..., :3, :3], points_b) + T_a_b[..., :3, 3]
+    points_a: np.ndarray = np.einsum("...ij,...j->...i", T_a_b[..., :3, :3], points_b) + T_a_b[..., :3, 3]
+    return points_a
 
 
 def adjoint(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6 6"]:
@@ -156,7 +162,8 @@ def se3_log(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6"]:
 
 def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, ...]:
     """Geodesic angle of rotations in rad, `||log R||_F / sqrt 2`, accurate near zero and near pi."""
-    return np.linalg.norm(so3_log(R), axis=-1)
+    angle: np.ndarray = np.linalg.norm(so3_log(R), axis=-1)
+    return angle
 
 
 def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None) -> np.ndarray:

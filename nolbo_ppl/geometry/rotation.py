@@ -27,7 +27,8 @@ def _axis_rotation(axis: int, cosine: Tensor, sine: Tensor) -> Tensor:
         0: (one, zero, zero, zero, cosine, -sine, zero, sine, cosine),
         2: (cosine, -sine, zero, sine, cosine, zero, zero, zero, one),
     }[axis]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    matrix = torch.stack(rows, dim=-1)
+    return matrix.reshape(*matrix.shape[:-1], 3, 3)
 
 
 def viewpoint_moments_to_matrix(
@@ -96,7 +97,8 @@ def quaternion_to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor,
         2 * (y * z + x * w),
         1 - 2 * (x * x + y * y),
     )
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    matrix = torch.stack(rows, dim=-1)
+    return matrix.reshape(*matrix.shape[:-1], 3, 3)
 
 
 def matrix_to_quaternion(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -139,7 +141,8 @@ def ray_rotation(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         raise input_error("no rotation from the optical axis to a ray", got=ray.tolist(), expected="a point in front")
     k = 1 / (1 + z)
     rows = (1 - k * x * x, -k * x * y, x, -k * x * y, 1 - k * y * y, y, -x, -y, z)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    matrix = torch.stack(rows, dim=-1)
+    return matrix.reshape(*matrix.shape[:-1], 3, 3)
 
 
 def allocentric_to_egocentric(

@@ -89,7 +89,7 @@ def voxels_to_mesh(
     from skimage.measure import marching_cubes  # delayed: heavy to import
 
     n = values.shape[0]
-    vertices, faces, _, _ = marching_cubes(np.pad(values, 1), level, gradient_direction="ascent")
+    vertices, faces, _, _ = marching_cubes(np.pad(values, 1), level, gradient_direction="ascent")  # type: ignore[no-untyped-call]
     return (vertices.astype(np.float64) - 0.5) / n - 0.5, faces.astype(np.int64)
 
 
@@ -126,12 +126,14 @@ def reduce_voxels(
     thin = fine & ~bulk[radius:-radius, radius:-radius, radius:-radius]
     filled = thin.reshape(n, k, n, k, n, k).any(axis=5).any(axis=3).any(axis=1)
     if k % 2:
-        return filled | fine[radius::k, radius::k, radius::k]
+        closed: np.ndarray = filled | fine[radius::k, radius::k, radius::k]
+        return closed
     around = np.zeros((n, n, n), dtype=np.uint8)
     for corner in np.ndindex(2, 2, 2):
         x, y, z = (slice(radius - 1 + c, None, k) for c in corner)
         around += fine[x, y, z]
-    return filled | (around >= 4)
+    closed = filled | (around >= 4)
+    return closed
 
 
 def _spread(grid: Bool[np.ndarray, "a b c"], radius: int) -> Bool[np.ndarray, "a b c"]:

@@ -53,7 +53,7 @@ _SILENT = re.compile(
 """Fields of a JSON file that say nothing about the geometry."""
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """Safe YAML that takes OpenCV's matrices as what they hold."""
 
 

@@ -71,7 +71,8 @@ def _parse_box(at: _Line, row: dict[str, Any], where: str, width: int, height: i
     limit = np.array([width, height, width, height])
     if (box < -BORDER_TOLERANCE).any() or (box > limit + BORDER_TOLERANCE).any():
         raise at.error(f"{where}box", box.tolist(), f"inside the image of {width} x {height} px", "cut it to the image")
-    return np.clip(box, 0, limit)
+    inside: np.ndarray = np.clip(box, 0, limit)
+    return inside
 
 
 def _parse_rotation(at: _Line, row: dict[str, Any], where: str) -> np.ndarray:

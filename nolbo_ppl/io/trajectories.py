@@ -52,7 +52,8 @@ class Trajectory:
     @property
     def known(self) -> Bool[np.ndarray, " n"]:
         """Rows that hold a pose."""
-        return np.isfinite(self.T_world_camera).all(axis=(1, 2))
+        known: np.ndarray = np.isfinite(self.T_world_camera).all(axis=(1, 2))
+        return known
 
 
 def read_trajectory(
@@ -206,7 +207,8 @@ class FramePoses:
     @property
     def known(self) -> Bool[np.ndarray, " n"]:
         """Frames with a pose."""
-        return np.isfinite(self.T_world_camera).all(axis=(1, 2))
+        known: np.ndarray = np.isfinite(self.T_world_camera).all(axis=(1, 2))
+        return known
 
     def remarks(self, what: str = "truth") -> list[str]:
         """What a reader of the figures has to know: frames without a pose, rows left out."""

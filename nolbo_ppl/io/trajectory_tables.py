@@ -209,7 +209,8 @@ def _check_lost(path: Path, rows: np.ndarray, lines: np.ndarray, lost: bool) -> 
     if far.any():
         k = int(np.argmax(far))
         raise input_error("a value is out of range", expected=f"within {MAX_DISTANCE:g}", file=path, line=int(lines[k]))
-    return finite.all(axis=1)
+    complete: np.ndarray = finite.all(axis=1)
+    return complete
 
 
 def parse_table(path: Path, lines: Sequence[str], form: TableFormat | None = None, *, lost: bool = False) -> PoseTable:

@@ -94,7 +94,8 @@ def normalised_error_squared(error: Float[np.ndarray, "n d"], covariance: Float[
         solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     except np.linalg.LinAlgError:
         raise input_error("a covariance is singular", do="leave out what is known exactly (the first pose)") from None
-    return np.sum(error * solved, axis=-1) / error.shape[-1]
+    nees: np.ndarray = np.sum(error * solved, axis=-1) / error.shape[-1]
+    return nees
 
 
 def brier_score(weight: Float[np.ndarray, " p"], correct: np.ndarray) -> float:

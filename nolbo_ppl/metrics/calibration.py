@@ -134,7 +134,8 @@ def chi_square_mass(
         distance = (np.linalg.solve(half, difference[..., None])[..., 0] ** 2).sum(1)
     else:
         raise input_error("covariance", got=covariance.shape, expected=f"({n}, {d}, {d}) or ({n}, {d})")
-    return gammainc(d / 2, distance / 2)
+    mass: np.ndarray = gammainc(d / 2, distance / 2)
+    return mass
 
 
 def circular_crps(log_density: Float[np.ndarray, "n nodes"], truth: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -160,9 +161,11 @@ def circular_crps(log_density: Float[np.ndarray, "n nodes"], truth: Float[np.nda
     # The distribution of V - V' on the nodes is the circular autocorrelation of the masses.
     lag = np.fft.irfft(np.abs(np.fft.rfft(mass, axis=1)) ** 2, nodes, axis=1)
     spread = lag @ angular_distance(2 * np.pi * np.arange(nodes) / nodes, np.zeros(1))
-    return to_truth - spread / 2
+    score: np.ndarray = to_truth - spread / 2
+    return score
 
 
 def angular_distance(a: Float[np.ndarray, "*#n"], b: Float[np.ndarray, "*#n"]) -> Float[np.ndarray, "*n"]:
     """Length of the shorter arc between two angles, rad."""
-    return np.abs(np.remainder(np.asarray(a) - b + np.pi, 2 * np.pi) - np.pi)
+    distance: np.ndarray = np.abs(np.remainder(np.asarray(a) - b + np.pi, 2 * np.pi) - np.pi)
+    return distance

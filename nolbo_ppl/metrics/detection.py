@@ -33,7 +33,8 @@ class Matches:
     @property
     def correct(self) -> Bool[np.ndarray, " n"]:
         """Matched to a truth that counts."""
-        return (self.truth >= 0) & ~self.ignored
+        counted: np.ndarray = (self.truth >= 0) & ~self.ignored
+        return counted
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,8 @@ def in_regions(box: Float[np.ndarray, "n 4"], region: Float[np.ndarray, "k 4"], 
     high = np.minimum(box[:, None, 2:], region[None, :, 2:])
     covered = np.prod(np.clip(high - low, 0, None), axis=-1)
     area = np.prod(np.clip(box[:, 2:] - box[:, :2], 0, None), axis=-1)
-    return (covered >= share * area[:, None]).any(1) & (area > 0)
+    mostly: np.ndarray = (covered >= share * area[:, None]).any(1) & (area > 0)
+    return mostly
 
 
 def match(

@@ -43,10 +43,12 @@ def rotation_error(
 def _axis_angle(relative: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """Angle between the vertical axes of two frames, accurate at both ends."""
     across = np.hypot(relative[:, 0, 2], relative[:, 1, 2])
-    return np.arctan2(across, relative[:, 2, 2])
+    azimuth: np.ndarray = np.arctan2(across, relative[:, 2, 2])
+    return azimuth
 
 
 def _least_angle(relative: Float[np.ndarray, "n 3 3"], order: int) -> Float[np.ndarray, " n"]:
     """Least angle over the group of turns about the vertical axis."""
     turns = so3_exp(np.arange(order)[:, None] * (2 * math.pi / order) * np.array([0.0, 0.0, 1.0]))
-    return rotation_angle(turns[:, None] @ relative).min(0)
+    least: np.ndarray = rotation_angle(turns[:, None] @ relative).min(0)
+    return least

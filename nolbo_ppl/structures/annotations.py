@@ -79,7 +79,8 @@ class Annotations:
     @property
     def side(self) -> Float[np.ndarray, " m"]:
         """Longer side of each box, px."""
-        return np.max(self.box[:, 2:] - self.box[:, :2], axis=1, initial=0.0)
+        side: np.ndarray = np.max(self.box[:, 2:] - self.box[:, :2], axis=1, initial=0.0)
+        return side
 
     def counts(self, min_side: float = MIN_SIDE, min_visibility: float = MIN_VISIBILITY) -> Bool[np.ndarray, " m"]:
         """Objects that are to be found: boxes with a side of at least so many px, and at least so much of the object seen."""

@@ -95,32 +95,38 @@ class Detections:
     @property
     def latent_dim(self) -> int:
         """Dimension of the latents, 0 when there are none."""
-        return self.latent.shape[1]
+        count: int = self.latent.shape[1]
+        return count
 
     @property
     def modes(self) -> int:
         """Most modes an orientation has, 0 when none are stated."""
-        return self.mode_weight.shape[1]
+        count: int = self.mode_weight.shape[1]
+        return count
 
     @property
     def has_rotation(self) -> Bool[np.ndarray, " n"]:
         """Rows with an orientation."""
-        return np.isfinite(self.rotation[:, 0, 0])
+        known: np.ndarray = np.isfinite(self.rotation[:, 0, 0])
+        return known
 
     @property
     def has_latent(self) -> Bool[np.ndarray, " n"]:
         """Rows with a latent."""
-        return np.isfinite(self.latent).all(axis=1) & (self.latent_dim > 0)
+        known: np.ndarray = np.isfinite(self.latent).all(axis=1) & (self.latent_dim > 0)
+        return known
 
     @property
     def has_box(self) -> Bool[np.ndarray, " n"]:
         """Rows with a box in the image."""
-        return np.isfinite(self.box).all(axis=1)
+        known: np.ndarray = np.isfinite(self.box).all(axis=1)
+        return known
 
     @property
     def has_azimuth(self) -> Bool[np.ndarray, " n"]:
         """Rows that state the modes of their azimuth."""
-        return np.isfinite(self.azimuth_weight).any(axis=1)
+        known: np.ndarray = np.isfinite(self.azimuth_weight).any(axis=1)
+        return known
 
     def select(self, rows: np.ndarray) -> Detections:
         """The given rows (indices or a mask), in that order."""

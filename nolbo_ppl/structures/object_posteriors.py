@@ -135,7 +135,8 @@ class ObjectPosteriors:
     @property
     def class_posterior(self) -> Float[np.ndarray, "n labels"]:
         """q(l | I)."""
-        return np.exp(self.class_log_posterior)
+        probability: np.ndarray = np.exp(self.class_log_posterior)
+        return probability
 
     def mesh(self, index: int, metric: bool = True) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
         """Mesh of an object's mean shape by marching cubes, in its own frame; in metres, or in units of the diagonal.
