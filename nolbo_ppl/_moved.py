@@ -156,7 +156,7 @@ MOVED = {
     "mission.demo": "pipeline.demo_run",
     "mission.depth": "pipeline.depth_refinement",
     "mission.figures": "evaluation.sequence_scores",
-    "mission.noise": "pipeline.noise_file",
+    "mission.noise": "io.noise_file",
     "mission.observe": "pipeline.perception",
     "mission.pipeline": "pipeline.mapping_pipeline",
     "mission.scene": "pipeline.map_mesh",

@@ -20,11 +20,11 @@ from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_incremental
 from nolbo_ppl.inference.slam.map_files import library_versions, write_result
 from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.noise_file import write_noise
 from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.io.trajectories import Trajectory
 from nolbo_ppl.pipeline.map_mesh import build_scene, write_glb
-from nolbo_ppl.pipeline.noise_file import write_noise
 from nolbo_ppl.pipeline.perception import DepthSource, observe_sequence
 from nolbo_ppl.pipeline.run_config import RunConfig
 from nolbo_ppl.pipeline.run_inputs import RunInputs, depth_of_drive, estimate_or_read, keyframe_rows, open_run_inputs

@@ -30,10 +30,10 @@ from nolbo_ppl.evaluation.sequence_truth import (
     read_ground_truth,
 )
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
+from nolbo_ppl.io.noise_file import read_noise
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import path_length, trajectory_errors
 from nolbo_ppl.odometry import StepFlag
-from nolbo_ppl.pipeline.noise_file import read_noise
 from nolbo_ppl.structures.detections import Detections
 
 ASSOCIATION_IOU = 0.3

@@ -9,15 +9,28 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, estimate_noise
-from nolbo_ppl.pipeline.noise_file import TEXTS, read_noise, write_noise
-from tests.simulated_sequence import SimulatedDrive
+from nolbo_ppl.io.noise_file import TEXTS, read_noise, write_noise
+from nolbo_ppl.structures.noise_model import NoiseModel
 
 
 @pytest.mark.parametrize("stated", [True, False])
-def test_noise_comes_back(drive: SimulatedDrive, tmp_path: Path, stated: bool) -> None:
-    covariance = np.tile(np.diag([1e-5] * 3 + [1e-3] * 3), (len(drive.truth) - 1, 1, 1)) if stated else None
-    noise = estimate_noise(SlamProblem(drive.truth, drive.model.table, covariance), SlamConfig())
+def test_noise_comes_back(tmp_path: Path, stated: bool) -> None:
+    rng = np.random.default_rng(3)
+    noise = NoiseModel(
+        rotation_step=rng.random(4),
+        translation_step=rng.random(4),
+        position_covariance=rng.random((7, 3, 3)),
+        rotation_scale=rng.random(7),
+        latent_scale=rng.random((7, 5)),
+        new_rate=0.1,
+        clutter_rate=1e-3,
+        report={"position_lateral": 0.3},
+        warnings=("too small",),
+        position_factor=1.7,
+        range_factor=2.5,
+        rotation_factor=1.1,
+        step_correlation=rng.random((4, 6, 6)) if stated else None,
+    )
     write_noise(tmp_path / "noise.npz", noise)
     back = read_noise(tmp_path / "noise.npz")
     for field in fields(noise):

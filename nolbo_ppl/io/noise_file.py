@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.inference.slam import NoiseModel
 from nolbo_ppl.io.npz import Npz, save_npz
+from nolbo_ppl.structures.noise_model import NoiseModel
 
 TEXTS = ("report", "warnings")
 """What `slam/summary.json` tells already."""
 
 
 def write_noise(path: Path, noise: NoiseModel) -> None:
-    """Write the numbers of a noise model as one NPZ file, atomically."""
+    """Write the numbers of a noise model as one NPZ file (`noise.npz` of a run), atomically."""
     values = {field.name: getattr(noise, field.name) for field in fields(noise) if field.name not in TEXTS}
     save_npz(path, {name: value for name, value in values.items() if value is not None})
 
