@@ -7,8 +7,8 @@ it is missing), and an annotation `difficult` and a viewpoint `azimuth`, `elevat
 from __future__ import annotations
 
 import os
-from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage, ArchiveObject, write_archive
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.coco_file import read_coco_images
 
 
 @dataclass(frozen=True)
@@ -59,49 +59,38 @@ def read_photographs(
     file = Path(path)
     file = file / "val.json" if file.is_dir() else file
     folder = file.parent / "images" if images is None else Path(images)
-    content = read_json(file)
-    if not isinstance(content, dict) or not all(
-        isinstance(content.get(k), list) for k in ("images", "annotations", "categories")
-    ):
-        raise input_error("not a COCO file", expected='{"images": [...], "annotations": [...], "categories": [...]}', file=file)
-    label = {one["id"]: categories.index(one["name"]) for one in content["categories"] if one.get("name") in categories}
-    of_image: dict[Any, list[dict[str, Any]]] = defaultdict(list)
-    for row in content["annotations"]:
-        of_image[row.get("image_id")].append(row)
     found = []
-    for row in content["images"]:
-        name = row.get("file_name")
-        if not isinstance(name, str) or not (folder / name).is_file():
-            raise input_error("image", got=name, expected=f"an image file in {folder}", file=file)
-        things = [_thing(one, label, file) for one in of_image[row.get("id")] if one.get("category_id") in label]
-        known = row.get("exhaustive")
+    for image in read_coco_images(file, folder):
+        if not image.path.is_file():
+            raise input_error("image", got=image.fields["file_name"], expected=f"an image file in {folder}", file=file)
+        objects = [one for one in image.annotations if one.category in categories]
+        known = image.fields.get("exhaustive")
         found.append(
             Photograph(
-                folder / name, int(row["width"]), int(row["height"]), str(row.get("source", "")),
+                image.path,
+                *image.size,
+                str(image.fields.get("source", "")),
                 frozenset(range(len(categories)) if known is None else (categories.index(c) for c in known if c in categories)),
-                np.array([thing[0] for thing in things], dtype=np.float64).reshape(-1, 4),
-                np.array([thing[1] for thing in things], dtype=np.int64),
-                np.array([thing[2] for thing in things], dtype=bool),
-                np.array([thing[3] for thing in things], dtype=np.float64).reshape(-1, 3),
-                str(row.get("licence", "")),
+                np.array([one.box for one in objects], dtype=np.float64).reshape(-1, 4),
+                np.array([categories.index(one.category) for one in objects], dtype=np.int64),
+                np.array([bool(one.crowd or one.fields.get("difficult")) for one in objects], dtype=bool),
+                np.array([_viewpoint(one.fields) for one in objects], dtype=np.float64).reshape(-1, 3),
+                str(image.fields.get("licence", "")),
             )
-        )  # fmt: skip
+        )
     if not found:
         raise input_error("a data set without images", got=file, expected="at least one")
     return found
 
 
-def _thing(row: dict[str, Any], label: dict[Any, int], file: Path) -> tuple[list[float], int, bool, list[float]]:
-    box = row.get("bbox")
-    if not isinstance(box, list) or len(box) != 4 or not np.isfinite(np.array(box, dtype=np.float64)).all():
-        raise input_error(f"bbox of annotation {row.get('id')}", got=box, expected="[x, y, width, height] in px", file=file)
-    x, y, width, height = (float(v) for v in box)
-    angles = [float("nan")] * 3
-    if row.get("azimuth") is not None:
-        angles = [float(np.radians(row.get(name) or 0.0)) for name in ("azimuth", "elevation", "theta")]
-        angles[2] = -angles[2]  # these poses turn the picture clockwise, PASCAL3D+ the other way (seen on tilted cars)
-        angles[0] = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
-    return [x, y, x + width, y + height], label[row["category_id"]], bool(row.get("difficult") or row.get("iscrowd")), angles
+def _viewpoint(fields: Mapping[str, Any]) -> list[float]:
+    """Allocentric azimuth, elevation and in-plane rotation, rad; NaN where not stated."""
+    if fields.get("azimuth") is None:
+        return [float("nan")] * 3
+    angles = [float(np.radians(fields.get(name) or 0.0)) for name in ("azimuth", "elevation", "theta")]
+    angles[2] = -angles[2]  # these poses turn the picture clockwise, PASCAL3D+ the other way (seen on tilted cars)
+    angles[0] = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
+    return angles
 
 
 def convert_photographs(
