@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_in
 from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.files import atomic_path, write_jsonl
 from nolbo_ppl.io.output_folder import output_folder
-from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.pipeline.perception import observe_images
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 
@@ -109,19 +110,18 @@ def is_result(folder: Path) -> bool:
 
 
 def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel, folder: Path) -> Iterator[dict]:
-    bar = progress_bar(None, "observing", "image", total=len(frames))
-    with bar:
-        for first in range(0, len(frames), config.batch):
-            part = range(first, min(first + config.batch, len(frames)))
-            images = [frames.image(k) for k in part]
-            observed = model.observe(
-                images, config.intrinsics, threshold=config.threshold, size=config.size, batch=config.batch, seed=config.seed
-            )
-            for k, image, observations in zip(part, images, observed):
-                yield from observations.to_records(k, frames.name(k))
-                if config.pictures:
-                    _draw(config, folder / picture_name(frames.name(k)), image, observations, model)
-            bar.update(len(part))
+    observe = partial(
+        model.observe,
+        intrinsics=config.intrinsics,
+        threshold=config.threshold,
+        size=config.size,
+        batch=config.batch,
+        seed=config.seed,
+    )
+    for k, image, observed in observe_images(observe, frames.image, len(frames), config.batch):
+        yield from observed.to_records(k, frames.name(k))
+        if config.pictures:
+            _draw(config, folder / picture_name(frames.name(k)), image, observed, model)
 
 
 def _draw(config: ObserveConfig, path: Path, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:

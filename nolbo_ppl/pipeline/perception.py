@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -174,14 +174,28 @@ def observe_sequence(
         times: seconds of each keyframe; none where nobody knows them.
     """
     tables = []
-    with progress_bar(None, "observing", "image", total=len(names)) as bar:
-        for first in range(0, len(names), batch):
-            frames = range(first, min(first + batch, len(names)))
-            images = [read(k) for k in frames]
-            for k, image, observed in zip(frames, images, observe(images, intrinsics)):
-                known = depth.depth(k, image)
-                if known is not None:
-                    observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
-                tables.append(observed.detections(k, names[k], times[k] if times else None))
-            bar.update(len(frames))
+    for k, image, observed in observe_images(lambda images: observe(images, intrinsics), read, len(names), batch):
+        known = depth.depth(k, image)
+        if known is not None:
+            observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
+        tables.append(observed.detections(k, names[k], times[k] if times else None))
     return Detections.concatenate(tables)
+
+
+def observe_images(
+    observe: Callable[[Sequence[Picture]], Sequence[ObjectPosteriors]], read: Callable[[int], Picture], count: int, batch: int
+) -> Iterator[tuple[int, Picture, ObjectPosteriors]]:
+    """Number, image and posteriors of every image of a sequence, in order.
+
+    Args:
+        observe: posteriors of each of some images.
+        read: image of a number.
+        count: how many there are.
+        batch: images in memory, and through the network, at once.
+    """
+    with progress_bar(None, "observing", "image", total=count) as bar:
+        for first in range(0, count, batch):
+            part = range(first, min(first + batch, count))
+            images = [read(k) for k in part]
+            yield from zip(part, images, observe(images))
+            bar.update(len(part))
