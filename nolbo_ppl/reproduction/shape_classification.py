@@ -144,7 +144,7 @@ def fit_shape_vae(
                 report(info)
             if checkpoint is not None and (run.state.step % config.checkpoint_every == 0 or run.finished):
                 save_tensors(checkpoint, optimisation.state_tensors(run.state), {"identity": identity, "step": run.state.step})
-    run.adopt_average()
+    run.load_ema()
     model.set_half_precision(False)
     return model.eval().requires_grad_(False)
 

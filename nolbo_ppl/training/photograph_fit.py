@@ -26,11 +26,11 @@ from nolbo_ppl.progress import progress_bar
 
 PARTS = 3
 """Of labelled photographs, every third from the first is fitted on, every third from the second measured, the rest kept."""
-LEAST_SIDE = 24.0
+MIN_SIDE = 24.0
 """Longer side, px, from which on an object counts (as in `nolbo_ppl.evaluation.photograph_scores`)."""
-LEAST_ODDS = -4.6
+MIN_ODDS = -4.6
 """Detections of lower log odds, 0.01, are not looked at."""
-LEAST_DETECTIONS = 30
+MIN_DETECTIONS = 30
 """Fewer judged detections, right or wrong, fix no factor."""
 
 
@@ -80,7 +80,7 @@ def find_objects(model: Nolbo, photos: Sequence[Photograph], batch: int = 16) ->
             found = []
             for first in progress_bar(range(0, len(photos), batch), "photographs to fit", "batch"):
                 images = [read_image(photo.image) for photo in photos[first : first + batch]]
-                found += observer.observe(images, threshold=1 / (1 + np.exp(-LEAST_ODDS)), decode=False, batch=batch)
+                found += observer.observe(images, threshold=1 / (1 + np.exp(-MIN_ODDS)), decode=False, batch=batch)
             parts.append([one.class_log_posterior for one in found])
     finally:
         guide.fusion.photograph.copy_(before)
@@ -136,7 +136,7 @@ def mean_precision(found: FoundObjects, photos: Sequence[Photograph], log_poster
 def fit_found(found: FoundObjects, photos: Sequence[Photograph]) -> PhotographFit | None:
     """The four numbers by maximum likelihood; None where there are too few detections to tell."""
     counted, right, category = judged(found, photos, found.own.argmax(1))
-    if min(int((counted & right).sum()), int((counted & ~right).sum())) < LEAST_DETECTIONS:
+    if min(int((counted & right).sum()), int((counted & ~right).sum())) < MIN_DETECTIONS:
         return None
     factor, shift = _logistic(found.log_odds[counted], right[counted])
     objects = category >= 0
@@ -163,7 +163,7 @@ def adopt_fit(model: Nolbo, fit: PhotographFit) -> None:
 
 def _not_to_be_found(photo: Photograph) -> Bool[np.ndarray, " m"]:
     """Small, difficult, crowds."""
-    return photo.ignore | (np.max(photo.box[:, 2:] - photo.box[:, :2], axis=1, initial=0.0) < LEAST_SIDE)
+    return photo.ignore | (np.max(photo.box[:, 2:] - photo.box[:, :2], axis=1, initial=0.0) < MIN_SIDE)
 
 
 def _normalised(logits: Float[np.ndarray, "n labels"]) -> Float[np.ndarray, "n labels"]:

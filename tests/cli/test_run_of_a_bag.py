@@ -13,7 +13,7 @@ from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.io.files import read_json
 from nolbo_ppl.io.ros_bags import Bag
 from nolbo_ppl.io.trajectories import read_trajectory
-from nolbo_ppl.pipeline.mapping_pipeline import run_mission
+from nolbo_ppl.pipeline.mapping_pipeline import run_pipeline
 from nolbo_ppl.pipeline.run_config import RunConfig
 from tests.bags import FORWARD, BagWriter
 
@@ -46,11 +46,11 @@ def test_a_run_of_a_bag_is_that_of_its_images(drive: Path, tmp_path: Path) -> No
     same = {"sizes": (96,), "report": False, "threshold": 0.6}
     bag = drive / "bag"
     config = RunConfig(bag, tmp_path / "bag", topic="/camera/image", odometry=Path(f"{bag}:/odom"), mcap=True, **same)
-    of_bag = run_mission(config)
+    of_bag = run_pipeline(config)
     files = RunConfig(
         drive / "images", tmp_path / "files", intrinsics=drive / "camera.txt", odometry=drive / "odometry.txt", **same
     )
-    of_files = run_mission(files)
+    of_files = run_pipeline(files)
     assert of_bag["frames"] == of_files["frames"] == 5 and of_bag["observations"] == of_files["observations"]
     assert of_bag["remarks"] == ["the camera is that of /camera/camera_info"]
     read = [read_trajectory(tmp_path / name / "odometry.txt").T_world_camera for name in ("bag", "files")]
@@ -59,7 +59,7 @@ def test_a_run_of_a_bag_is_that_of_its_images(drive: Path, tmp_path: Path) -> No
     assert read_json(first) == read_json(second)
     with Bag(tmp_path / "bag" / "map.mcap") as written:
         assert {"/nolbo/trajectory", "/nolbo/objects", "/tf"} <= set(written.topics)
-    assert run_mission(config) == of_bag  # nothing is done again
+    assert run_pipeline(config) == of_bag  # nothing is done again
 
 
 def test_observe_and_odometry(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -118,7 +118,7 @@ def test_detections_are_found_as_they_are(tmp_path: Path, single_precision: None
     photos = read_photographs(write(tmp_path), categories=model.config.categories)
     found = find_objects(model, photos, batch=1)
     assert torch.equal(model.guide.fusion.photograph, before)
-    assert len(found.scene) > 0 and set(found.scene.tolist()) <= {0, 1} and (found.log_odds >= photograph_fit.LEAST_ODDS).all()
+    assert len(found.scene) > 0 and set(found.scene.tolist()) <= {0, 1} and (found.log_odds >= photograph_fit.MIN_ODDS).all()
     np.testing.assert_allclose(np.exp(found.own).sum(1), 1.0, rtol=1e-6)
     assert np.isfinite(found.look).all()
     fit = fit_found(*drawn(600, True))
