@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import copy_context
+from itertools import pairwise
 
 from nolbo_ppl._version import __version__
 from nolbo_ppl.errors import NolboError
@@ -57,6 +58,8 @@ def main(args: Sequence[str] | None = None) -> None:
     if args[0] not in VERBS:
         print(f"nolbo: unknown verb {args[0]!r}\n\n{usage()}", file=sys.stderr)
         raise SystemExit(2)
+    if _empty_output(args):
+        raise _end(args[0], "--out is empty; name a folder (. for the current one)", 2)
     shown = copy_context()
     shown.run(show_progress)
     with _signals():
@@ -76,6 +79,11 @@ def main(args: Sequence[str] | None = None) -> None:
             raise _end(args[0], "interrupted", 128 + signal.SIGINT) from None
         except Stopped as stop:
             raise _end(args[0], f"stopped by signal {stop}", 128 + stop.number) from None
+
+
+def _empty_output(args: Sequence[str]) -> bool:
+    """Whether `--out` names nothing, as an unset variable of a script does: it would be the current folder."""
+    return "--out=" in args or any(name == "--out" and not value.strip() for name, value in pairwise(args))
 
 
 def system_message(error: OSError) -> str:

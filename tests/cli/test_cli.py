@@ -126,6 +126,17 @@ def test_documented_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
             assert re.search(re.escape(option) + r"(?![a-z0-9-])", helps[key]), f"{document}: {option} of nolbo {key}"
 
 
+@pytest.mark.parametrize("empty", [["--out", ""], ["--out="], ["--out", " "]])
+def test_an_empty_output_is_not_the_current_folder(
+    empty: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as caught:
+        main(["simulate", *empty, "--frames", "4"])
+    assert caught.value.code == 2 and "--out is empty" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_the_system_says_is_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "file"
     file.write_text("x")

@@ -247,6 +247,23 @@ class IncrementalGraph:
                 self.remove(number)
         self._bridge(pose, onto)
 
+    def forget(self, poses: list[int], onto: int) -> None:
+        """Take out poses with all their factors; their places, and those that hang on them, are kept relative to another one."""
+        T_onto = inverse(self.pose(onto))
+        for pose in poses:
+            T = T_onto @ self.pose(pose)
+            for number in sorted(self.of_pose.get(pose, ())):
+                self.remove(number)
+            self._hang(pose, onto, T)
+
+    def _hang(self, pose: int, onto: int, T: Float[np.ndarray, "4 4"]) -> None:
+        """A pose, and what hangs on it, stands relative to another one from now on."""
+        for frame in self.carried.pop(pose, []):
+            self.attached[frame] = (onto, T @ self.attached[frame][1])
+            self.carried.setdefault(onto, []).append(frame)
+        self.attached[pose] = (onto, T)
+        self.carried.setdefault(onto, []).append(pose)
+
     def _bridge(self, pose: int, onto: int) -> None:
         """Eliminate a pose that has steps alone: exact, but for its place, which is frozen relative to `onto`."""
         T = inverse(self.pose(onto)) @ self.pose(pose)
@@ -256,11 +273,7 @@ class IncrementalGraph:
         for number in (before, after):
             if number is not None:
                 self.remove(number)
-        for frame in self.carried.pop(pose, []):
-            self.attached[frame] = (onto, T @ self.attached[frame][1])
-            self.carried.setdefault(onto, []).append(frame)
-        self.attached[pose] = (onto, T)
-        self.carried.setdefault(onto, []).append(pose)
+        self._hang(pose, onto, T)
 
     # -- solving ------------------------------------------------------------------------------------------------------
 

@@ -187,6 +187,12 @@ class LoopCloser:
                 self.flush(frame, graph)
         return len(found)
 
+    def forget(self, landmarks: set[int]) -> None:
+        """Landmarks that are no longer in the graph."""
+        self.map.forget(landmarks)
+        self.fresh = [j for j in self.fresh if j not in landmarks]
+        self.waiting = [m for m in self.waiting if not {self.map.standing(m.a), self.map.standing(m.b)} & landmarks]
+
     def _near(self, window: list[int], error: Float[np.ndarray, "n 6 s"], floor: float) -> list[int]:
         """Landmarks no farther from the window than the drift between their places can explain."""
         rows = np.searchsorted(self.map.numbers, window)

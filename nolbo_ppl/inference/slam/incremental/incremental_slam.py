@@ -20,6 +20,7 @@ from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
 from nolbo_ppl.inference.slam.detection_features import fit_prior
+from nolbo_ppl.inference.slam.incremental.forgetting import forget_oldest
 from nolbo_ppl.inference.slam.incremental.incremental_calibration import calibrate_incremental, default_calibration
 from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE_WEIGHT, LoopCloser
 from nolbo_ppl.inference.slam.incremental.incremental_memory import IncrementalMemory
@@ -140,6 +141,7 @@ class IncrementalSlam(IncrementalMemory):
         self.graph.commit()
         closings = self.loops.close(frame, self.graph, noise, self._live())
         self.T_world_camera = self.graph.pose(frame)
+        forget_oldest(self.graph, self.loops, self.keeper, frame, self._live())
         return IncrementalInfo(frame, self.T_world_camera, len(self.loops.map), closings, met, len(self.graph.of_pose))
 
     def _live(self) -> set[int]:

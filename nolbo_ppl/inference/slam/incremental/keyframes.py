@@ -7,6 +7,7 @@ the map a little less certain than it could be, never more. Those that first exp
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from nolbo_ppl.errors import input_error
@@ -27,8 +28,16 @@ class KeyframeConfig:
     """Condensed keyframes from which one landmark is seen; beyond that the oldest go."""
     history: bool = True
     """Keep all detections for `finish`. Without, memory grows with the ground covered alone."""
+    max_memory: float | None = None
+    """Most MB of the running graph (an estimate, about 6 kB a factor); beyond it the oldest ground is forgotten, landmarks and
+    all (`forgetting`). Needs `history=False`. None: no bound."""
 
     def __post_init__(self) -> None:
+        bound = self.max_memory
+        if bound is not None and (isinstance(bound, bool) or not isinstance(bound, int | float) or not 1.0 <= bound < math.inf):
+            raise input_error("max_memory", got=bound, expected="a finite number of MB, at least 1")
+        if bound is not None and self.history:
+            raise input_error("max_memory with the history of all detections", do="set history=False (and do without `finish`)")
         for name, least in (("window", 10), ("stretch", 1), ("least_met", 1), ("passes", 1)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:

@@ -224,6 +224,13 @@ class RunningMap:
         keep = self.numbers != a
         self.numbers, self.position = self.numbers[keep], self.position[keep]
 
+    def forget(self, numbers: set[int]) -> None:
+        """Landmarks that are gone for good."""
+        for number in numbers:
+            self.landmarks.pop(number, None)
+        keep = ~np.isin(self.numbers, list(numbers))
+        self.numbers, self.position = self.numbers[keep], self.position[keep]
+
     def population(self) -> list[RunningLandmark]:
         """A few hundred landmarks of the whole map."""
         chosen = self.numbers[:: max(1, len(self.numbers) // POPULATION)]
