@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import make_pose
-from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam.clusters import clusters_of
 from nolbo_ppl.inference.slam.consistent_cliques import close_constellations
+from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.graph import (
     UNINFORMATIVE_ROTATION_SIGMA,
     LandmarkEqualities,
@@ -113,33 +113,19 @@ def soft_assignment(
     earlier iterations hold to be one object) stands as one candidate, by its best member. Returns newer tracklets,
     older ones, weights, and the log evidence above all tracklets being new.
     """
-    order = np.argsort(pairs.a, kind="stable")
-    sorted_a = pairs.a[order]
-    a_out, b_out, w_out, evidence = [], [], [], 0.0
-    for group in groups_seen_together(features.first, features.last):
-        spans = [order[np.searchsorted(sorted_a, i, "left") : np.searchsorted(sorted_a, i, "right")] for i in group]
-        rows = np.concatenate(spans)
-        if not len(rows):
-            continue
-        row_of = np.repeat(np.arange(len(group)), [len(s) for s in spans])
-        value = pairs.log_position[rows] + pairs.log_feature[rows]
-        columns, column = np.unique(cluster[pairs.b[rows]], return_inverse=True)
-        log_likelihood = np.full((len(group), len(columns)), -np.inf)
-        chosen = np.full((len(group), len(columns)), -1)
-        for k in np.argsort(value, kind="stable"):  # ascending: the best member of a cluster stays
-            log_likelihood[row_of[k], column[k]] = value[k]
-            chosen[row_of[k], column[k]] = pairs.b[rows[k]]
-        marginals = association_marginals(log_likelihood, np.full(len(group), log_new), associator=config.associator)
-        evidence += marginals.log_evidence - len(group) * log_new
-        weights = np.asarray(marginals.weights)
-        i, j = np.nonzero(weights > config.link_minimum)
-        a_out.append(group[i])
-        b_out.append(chosen[i, j])
-        w_out.append(weights[i, j])
-    if not a_out:
-        empty = np.zeros(0, dtype=np.int64)
-        return empty, empty, np.zeros(0), 0.0
-    return np.concatenate(a_out), np.concatenate(b_out), np.minimum(np.concatenate(w_out), 1.0), evidence
+    groups = groups_seen_together(features.first, features.last)
+    group = np.empty(len(features.first), dtype=np.int64)
+    group[np.concatenate([*groups, np.zeros(0, np.int64)])] = np.repeat(np.arange(len(groups)), [len(one) for one in groups])
+    value, candidate = pairs.log_position + pairs.log_feature, cluster[pairs.b]
+    order = np.lexsort((-value, candidate, pairs.a))
+    same = (np.diff(pairs.a[order]) == 0) & (np.diff(candidate[order]) == 0)
+    best = order[np.concatenate([np.ones(min(len(order), 1), dtype=bool), ~same])]
+    a, b = pairs.a[best], pairs.b[best]
+    log_null = np.full(len(group), log_new)
+    found = frame_marginals(group, a, candidate[best], value[best], log_null, associator=config.associator)
+    strong = found.weight > config.link_minimum
+    evidence = float(found.log_evidence.sum() - log_null.sum())
+    return a[strong], b[strong], np.minimum(found.weight[strong], 1.0), evidence
 
 
 def soft_landmark_equalities(state: SlamState, pairs: Pairs) -> tuple[LandmarkEqualities, float]:
