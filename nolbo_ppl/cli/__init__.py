@@ -26,6 +26,7 @@ VERBS = {
     "convert": "bring real data into the formats of slam and evaluate",
     "simulate": "write a simulated world for slam: odometry, detections, truth",
     "slam": "correct a trajectory and map objects, from odometry and observations",
+    "merge": "join the maps of several drives, where they share a place",
     "drive": "write a drive through a generated world: images, poses, objects",
     "odometry": "visual odometry of an image sequence",
     "run": "from the images of a drive to a corrected trajectory and a map of objects",

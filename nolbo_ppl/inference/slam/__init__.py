@@ -15,6 +15,7 @@ from nolbo_ppl.inference.slam.initialise import SlamState, init
 from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.reference_em import ReferenceEmInfo, ReferenceEmState, em_init, em_solve, em_step
+from nolbo_ppl.inference.slam.sessions import JointMap, SessionsResult, solve_sessions
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import iterate, solve
@@ -25,6 +26,7 @@ __all__ = [
     "Associations",
     "GraphError",
     "Landmark",
+    "JointMap",
     "LandmarkEqualities",
     "NoiseModel",
     "IncrementalSlam",
@@ -32,6 +34,7 @@ __all__ = [
     "IncrementalInfo",
     "ReferenceEmInfo",
     "ReferenceEmState",
+    "SessionsResult",
     "SlamConfig",
     "SlamProblem",
     "SlamResult",
@@ -47,6 +50,7 @@ __all__ = [
     "em_step",
     "solve",
     "solve_incremental",
+    "solve_sessions",
     "solve_with_associations",
     "step",
 ]

@@ -312,6 +312,18 @@ class Linearisation:
                 out[start + k] = solution[6 * block : 6 * block + 6, 6 * k : 6 * k + 6]
         return 0.5 * (out + np.swapaxes(out, 1, 2))
 
+    def joint_covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 b 6"]:
+        """Joint covariance of the given blocks, numbered as in `covariance`; what two of them share is off the diagonal."""
+        blocks = np.asarray(blocks, dtype=np.int64)
+        columns = (6 * blocks[:, None] + np.arange(6)).ravel()
+        out = np.empty((len(columns), len(columns)))
+        for start in range(0, len(columns), 384):
+            part = columns[start : start + 384]
+            right = np.zeros((self.jacobian.shape[1], len(part)))
+            right[part, np.arange(len(part))] = 1.0
+            out[:, start : start + 384] = self.factor.solve(right)[columns]
+        return (0.5 * (out + out.T)).reshape(len(blocks), 6, len(blocks), 6)
+
     def scale_deviations(self) -> Float[np.ndarray, " n-1"]:
         """Standard deviations of the scales of the odometry's steps; none where they are no state."""
         first, size = 6 * (self.landmarks + self.poses), self.jacobian.shape[1]

@@ -91,6 +91,23 @@ class SlamResult:
             return mixture_covariances(self.hypotheses, self.T_world_camera, rows)
         return self.linearisation.covariance(self.linearisation.landmarks + rows)
 
+    def joint_covariance(
+        self, poses: Int[np.ndarray, " r"], landmarks: Int[np.ndarray, " s"]
+    ) -> Float[np.ndarray, "r+s 6 r+s 6"]:
+        """Joint covariance of some poses and landmarks, in this order, [rotation rad, position m] each in its own frame.
+
+        Example: `C = result.joint_covariance([], [0, 5])`; `C[0, :, 1]` is the cross-covariance of landmarks 0 and 5. Given the
+        associations, of the best hypothesis alone.
+
+        Raises:
+            InputError: no such pose or landmark.
+        """
+        poses, landmarks = np.asarray(poses, dtype=np.int64), np.asarray(landmarks, dtype=np.int64)
+        for name, rows, count in (("pose", poses, len(self.T_world_camera)), ("landmark", landmarks, len(self.state.static))):
+            if len(rows) and (rows.min() < 0 or rows.max() >= count):
+                raise input_error(f"no such {name}", got=[int(rows.min()), int(rows.max())], expected=f"0 to {count - 1}")
+        return self.linearisation.joint_covariance(np.concatenate([self.linearisation.landmarks + poses, landmarks]))
+
     @property
     def scale(self) -> Float[np.ndarray, " n-1"] | None:
         """Metres per unit of the odometry at each of its steps, with `SlamConfig.scale_drift`; else None."""
