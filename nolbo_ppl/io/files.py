@@ -9,7 +9,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,21 @@ def inside(folder: str | os.PathLike[str], name: str, *, follow: bool = False) -
         return None
 
 
+def to_the_end(clean_up: Callable[[], None]) -> None:
+    """Clean up, once more where Ctrl-C or a signal falls into it: it takes milliseconds, and half of it leaves files behind.
+
+    Args:
+        clean_up: may be called again after any part of it.
+    """
+    try:
+        clean_up()
+    except Exception:
+        raise
+    except BaseException:
+        clean_up()
+        raise
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces `path` when the block ends, and vanishes when it raises.
@@ -100,7 +115,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             error.filename = str(path)  # a full disk is told without any name
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        to_the_end(lambda: temporary.unlink(missing_ok=True))
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from nolbo_ppl.errors import InputError, input_error
-from nolbo_ppl.io.files import TEMPORARY, read_json, write_json
+from nolbo_ppl.io.files import TEMPORARY, read_json, to_the_end, write_json
 
 LOCK = ".nolbo-lock"
 """The file whose lock a process holds while it writes into the folder."""
@@ -83,12 +83,17 @@ def locked(folder: str | os.PathLike[str], *, wait: bool = False) -> Iterator[No
     finally:
         if descriptor is not None:
             try:
-                (folder / LOCK).unlink(missing_ok=True)
+                to_the_end(lambda: (folder / LOCK).unlink(missing_ok=True))
             finally:
                 os.close(descriptor)
-        with suppress(OSError):  # not empty
-            for place in made:
-                place.rmdir()
+        to_the_end(lambda: _remove_empty(made))
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Delete folders, the innermost first, as long as they are empty."""
+    with suppress(OSError):
+        for folder in filter(Path.exists, folders):
+            folder.rmdir()
 
 
 def _acquire(folder: Path, wait: bool) -> int:
@@ -184,16 +189,16 @@ def output_folder(
         try:
             yield new
             write_json(new / OWN, sorted(own))
-            try:
-                os.replace(new, out / COMPLETE)
-                finish(out)
-            except Exception:
-                raise
-            except BaseException:  # Ctrl-C among the moves, which take milliseconds: they come to their end
-                finish(out)
-                raise
+            to_the_end(lambda: _put_in_place(new, out))
         finally:
-            shutil.rmtree(new, ignore_errors=True)
+            to_the_end(lambda: shutil.rmtree(new, ignore_errors=True))
+
+
+def _put_in_place(new: Path, out: Path) -> None:
+    """The complete folder takes the place of the old result; nothing where it did so before."""
+    if new.is_dir():
+        os.replace(new, out / COMPLETE)
+    finish(out)
 
 
 def _refuse_input(given: Path, out: Path, own: Collection[str]) -> None:

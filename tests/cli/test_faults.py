@@ -5,17 +5,19 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from nolbo_ppl.cli import main
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.io import output_folder as module
 from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.output_folder import contents, output_folder
 
@@ -123,27 +125,43 @@ def test_hooks_strike_at_the_call_they_are_told(tmp_path: Path) -> None:
 
 
 def test_an_interrupt_among_the_moves_ends_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever call Ctrl-C falls on, nothing is left over: the new result is there, or none."""
-    replace, seen = os.replace, set()
-    for last in range(4):
+    """Whatever call Ctrl-C falls on, before it or after it, nothing is left over: the new result is there, or none."""
+    seen = set()
+    for number in range(2 * 30):
         calls = 0
 
-        def counted(*names: object) -> None:
-            nonlocal calls
-            calls += 1
-            if calls == last + 1:  # noqa: B023 - called within the turn
-                raise KeyboardInterrupt
-            replace(*names)
+        def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*names: Any, **options: Any) -> Any:
+                nonlocal calls
+                calls += 1
+                mine = calls == number // 2 + 1  # noqa: B023 - called within the turn
+                if mine and number % 2:  # noqa: B023
+                    function(*names, **options)
+                if mine:
+                    raise KeyboardInterrupt
+                return function(*names, **options)
 
-        out = tmp_path / str(last)
-        monkeypatch.setattr(module.os, "replace", counted)
-        with pytest.raises(KeyboardInterrupt), output_folder(out, ("a", "b"), is_own=lambda _: False) as folder:
-            (folder / "a").write_text("a")
-            (folder / "b").write_text("b")
-        monkeypatch.setattr(module.os, "replace", replace)
+            return call
+
+        out = tmp_path / str(number) / "out"
+        with monkeypatch.context() as patch:
+            places = ((os, "replace"), (Path, "unlink"), (Path, "rmdir"), (shutil, "rmtree"))
+            for owner, name in places:
+                patch.setattr(owner, name, counted(getattr(owner, name)))
+            try:
+                with output_folder(out, ("a", "b"), is_own=lambda _: False) as folder:
+                    (folder / "a").write_text("a")
+                    (folder / "b").write_text("b")
+            except KeyboardInterrupt:
+                pass
+            else:
+                break
         found = sorted(path.name for path in out.iterdir()) if out.exists() else []
-        assert found in ([], ["a", "b"]), (last, found)
+        assert found in ([], ["a", "b"]), (number, found)
+        assert found or not (tmp_path / str(number)).exists(), number
         seen.add(tuple(found))
+    else:
+        pytest.fail("the calls never ended")
     assert seen == {(), ("a", "b")}
 
 
