@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import chain, rotation_angle
 from nolbo_ppl.odometry.depth_motion import depth_at
+from nolbo_ppl.odometry.ground_scale import LengthBelief
 from nolbo_ppl.odometry.keypoints import detect, grey, match, track
-from nolbo_ppl.odometry.odometry_config import KnownLengths, MeasuredDepth, OdometryConfig, Scale, StepFlag
+from nolbo_ppl.odometry.odometry_config import GroundHeight, KnownLengths, MeasuredDepth, OdometryConfig, Scale, StepFlag
 from nolbo_ppl.odometry.odometry_state import (
     DepthOfFrame,
     FrameSource,
@@ -106,6 +110,36 @@ def step(
     return after, taken
 
 
+def with_earlier_lengths(steps: Sequence[Step], lengths: Sequence[LengthBelief | None], scale: GroundHeight) -> list[Step]:
+    """The steps before the first ground was found, with the length of the first step that had one.
+
+    The belief in a length runs backwards as it runs forwards: a camera keeps its speed but for `acceleration`. A guess for all
+    of them would be wrong by the same factor in each, which no covariance of single steps can say: of 69 m, 23 were missing.
+    """
+    first = next((k for k, length in enumerate(lengths) if length is not None), None)
+    result = list(steps)
+    if first is None:
+        return result
+    known = lengths[first]
+    assert known is not None
+    for k in range(first - 1, -1, -1):
+        known = LengthBelief(known.length, float(np.hypot(known.log_scale, scale.acceleration)))
+        step = steps[k]
+        length = float(np.linalg.norm(step.T_earlier_later[:3, 3]))
+        if not step.flags & StepFlag.NO_SCALE or length <= 0:
+            continue
+        factor = known.length / length
+        T = step.T_earlier_later.copy()
+        T[:3, 3] *= factor
+        stretch = np.diag(np.repeat([1.0, factor], 3))
+        covariance = stretch @ step.covariance @ stretch
+        along = np.concatenate([np.zeros(3), T[:3, :3].T @ T[:3, 3] / known.length])
+        # Its own part along the way was that of the guess.
+        missing = known.scale**2 - float(along @ covariance @ along)
+        result[k] = replace(step, T_earlier_later=T, covariance=covariance + max(missing, 0.0) * np.outer(along, along))
+    return result
+
+
 def estimate_odometry(
     frames: FrameSource,
     intrinsics: Float[np.ndarray, " 4"],
@@ -155,9 +189,13 @@ def estimate_odometry(
         )
     state = init(setup, frames.frame(0), None if depth is None else depth(0))
     steps: list[Step] = []
+    lengths: list[LengthBelief | None] = []
     for k in progress_bar(range(1, len(frames)), "odometry", "frame", shown=progress):
         state, taken = step(setup, state, frames.frame(k), None if depth is None else depth(k))
         steps.append(taken)
+        lengths.append(state.length)
+    if isinstance(scale, GroundHeight):
+        steps = with_earlier_lengths(steps, lengths, scale)
     return Odometry(
         chain(np.eye(4), np.array([taken.T_earlier_later for taken in steps]).reshape(-1, 4, 4)),
         np.array([taken.covariance for taken in steps]).reshape(-1, 6, 6),

@@ -113,7 +113,9 @@ class ObjectMappingPipeline:
         else:
             ask = partial(self.model.observe, size=config.sizes[0], **options)
         names, times = self.run.image_names, [row.get("time") for row in self.run.frames]
-        seen = observe_sequence(ask, self.read, names, self.drive.intrinsics, self.depth_source(), config.batch, times)
+        seen = observe_sequence(
+            ask, self.read, names, self.drive.intrinsics, self.depth_source(), config.batch, times, config.usual_heights
+        )
         self.run.write_detections(seen)
 
     def slam(self) -> None:

@@ -14,6 +14,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.odometry import MeasuredDepth
 from nolbo_ppl.pipeline.depth_refinement import DepthScale, read_depth, refine_positions, stereo_depth, stereo_scale
+from nolbo_ppl.pipeline.size_refinement import refine_by_height
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
@@ -161,6 +162,7 @@ def observe_sequence(
     depth: DepthSource,
     batch: int,
     times: Sequence[float | None] = (),
+    usual_heights: bool = False,
 ) -> Detections:
     """Detections of every keyframe.
 
@@ -172,12 +174,15 @@ def observe_sequence(
         depth: refines positions where it is known.
         batch: images in memory at once.
         times: seconds of each keyframe; none where nobody knows them.
+        usual_heights: refine positions by the usual heights of categories where there is no depth.
     """
     tables = []
     for k, image, observed in observe_images(lambda images: observe(images, intrinsics), read, len(names), batch):
         known = depth.depth(k, image)
         if known is not None:
             observed = refine_positions(observed, known, (image.shape[1], image.shape[0]), depth.scale)
+        elif usual_heights:
+            observed = refine_by_height(observed, intrinsics, (image.shape[1], image.shape[0]))
         tables.append(observed.detections(k, names[k], times[k] if times else None))
     return Detections.concatenate(tables)
 
