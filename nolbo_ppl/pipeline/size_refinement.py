@@ -26,9 +26,10 @@ USUAL_HEIGHTS: dict[str, tuple[float, float]] = {
     "tvmonitor": (0.45, 0.15),
 }
 """Height and its standard deviation of the categories that have a usual one, m; boats and aeroplanes have none."""
-NEAR_SHARE = 0.7
-"""A box's lower edge is drawn by the near side of an object, its upper one by the far side where the camera is below the top: the
-box tells the distance of a place this share of the half extent before the centre."""
+NEAR_SHARE = 1.0
+"""A box's lower edge is drawn by the near side of an object, the upper one by a side that depends on where the camera is: the box
+tells the distance of a place this share of the half extent before the centre. With it the ranges of simulated cars are
+4 % too small in the median, those of KITTI's 2 %, with 0.7 6 and 5 %."""
 NEAR_SCALE = 0.3
 """How far that place may lie from there, in half extents."""
 HIDDEN = 0.1

@@ -12,6 +12,7 @@ from nolbo_ppl.odometry.ground_scale import LengthBelief
 from nolbo_ppl.odometry.keypoints import Features
 from nolbo_ppl.odometry.odometry_state import OdometryState
 from nolbo_ppl.odometry.planar_scene import PlanePast
+from nolbo_ppl.odometry.visual_odometry import with_earlier_lengths
 
 from .conftest import HEIGHT, INTRINSICS, WIDTH
 
@@ -135,3 +136,25 @@ def test_frames_that_follow_undo_a_wrong_twin() -> None:
     turned = branches[0].turned(R)
     np.testing.assert_allclose(R @ turned.normal, other, atol=1e-12)
     assert turned.against(np.eye(3), turned.normal, ahead) == 0.0
+
+
+def test_steps_before_the_first_ground_have_the_length_of_the_first_that_saw_it() -> None:
+    """Guessed at 0.1 m, measured from the third step on: the two before get its length, the nearer one more surely."""
+    turn = se3_exp(np.array([0, 0.1, 0, 0, 0, 0]))
+    steps = []
+    for k, length in enumerate((0.1, 0.1, 0.5)):
+        T = turn @ make_pose(np.eye(3), np.array([0, 0, length]))
+        covariance = np.diag([1e-6] * 3 + [0.01**2, 0.01**2, 0.1**2])
+        steps.append(Step(T, covariance, 100, 90, StepFlag.NO_SCALE if k < 2 else StepFlag.OK))
+    found = with_earlier_lengths(steps, [None, None, LengthBelief(0.5, 0.05)], GroundHeight(1.5))
+    lengths = [np.linalg.norm(step.T_earlier_later[:3, 3]) for step in found]
+    np.testing.assert_allclose(lengths, 0.5, rtol=1e-12)
+    # Along the camera's way: log-normal random walk backwards; across: the same angle over a longer way.
+    along = [np.sqrt(step.covariance[5, 5]) for step in found]
+    np.testing.assert_allclose(along[1::-1], [0.5, 0.5], rtol=0.01)  # five times the guess's own: the larger one stays
+    assert np.sqrt(found[0].covariance[3, 3]) == pytest.approx(0.05)
+    narrow = [Step(s.T_earlier_later, np.diag([1e-6] * 6), 100, 90, s.flags) for s in steps]
+    sure = with_earlier_lengths(narrow, [None, None, LengthBelief(0.5, 0.05)], GroundHeight(1.5))
+    expected = [0.5 * np.sqrt(0.05**2 + n * 0.1**2) for n in (2, 1)]
+    np.testing.assert_allclose([np.sqrt(step.covariance[5, 5]) for step in sure[:2]], expected, rtol=1e-6)
+    assert with_earlier_lengths(steps, [None] * 3, GroundHeight(1.5)) == steps
