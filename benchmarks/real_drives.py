@@ -69,6 +69,8 @@ class Arguments:
     """Observation model."""
     only: tuple[str, ...] = ()
     """Names of drives to run; all when empty."""
+    every: int = 1
+    """Use every so many-th image."""
     usual_heights: bool = True
     """Refine positions by the usual heights of categories."""
     sizes: tuple[int, ...] = (960,)
@@ -221,11 +223,12 @@ def kitti(arguments: Arguments, name: str) -> dict[str, Any]:
             sizes=arguments.sizes,
             usual_heights=arguments.usual_heights,
             visual=VISUAL,
+            every=arguments.every,
             **given,
         )
     )
     run, labels = RunFolder(out), labels_of(arguments.data / "kitti_tracking" / "labels" / "0000.txt")
-    labels = (labels + [[]] * len(poses))[: len(poses)]
+    labels, poses = (labels + [[]] * len(poses))[: len(poses)][:: arguments.every], poses[:: arguments.every]
     cars, both = truth_of(labels, poses, ("Car",)), truth_of(labels, poses, ("Car", "Van"))
     return {
         "summary": summary,
@@ -253,6 +256,7 @@ def desk(arguments: Arguments) -> dict[str, Any]:
             model=arguments.model,
             usual_heights=arguments.usual_heights,
             visual=VISUAL,
+            every=arguments.every,
         )
     )
     run = RunFolder(arguments.out / "fr1-visual")
