@@ -16,9 +16,11 @@ from torch import Tensor
 
 from nolbo_ppl.geometry.boxes import box_area, box_iou
 from nolbo_ppl.models.backbones import check_image, normalise_image
+from nolbo_ppl.models.category_sizes import CategorySizes
 from nolbo_ppl.models.crops import SIDE, cut_out, image_levels, range_shift
 from nolbo_ppl.models.evidence import ROLE_SIDE, Evidence, Fused, Fusion, detector_evidence, gather_evidence
 from nolbo_ppl.models.guide import Guide
+from nolbo_ppl.models.image_shift import ImageShift
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
@@ -67,6 +69,8 @@ class HybridGuide(Guide):
         super().__init__(config, prior)
         self.detector = YoloxNano()
         self.fusion = Fusion(2 * WIDTH, self.encoder.channels + 2 * WIDTH, config)
+        self.shift = ImageShift(self.encoder.channels + 2 * WIDTH)
+        self.sizes = CategorySizes(len(config.categories))
 
     def train(self, mode: bool = True) -> HybridGuide:
         """Training mode; the statistics of batch normalisations stay as they were learnt.
@@ -119,7 +123,10 @@ class HybridGuide(Guide):
         cell = cell.expand(len(image), -1)
         fused = self.fusion(one.detector, one.scene, one.context, cell, one.columns)
         box = decode_box(fused.box_loc, cell, one.columns, self.config)
-        return HybridEncoding(one.features, fused.objectness_logit, one.rows, one.columns, (), fused, box, one.levels)
+        with torch.no_grad():
+            shift, generated = self.shift(one.context), self.fusion.generated(one.context)
+        logit = fused.objectness_logit
+        return HybridEncoding(one.features, logit, one.rows, one.columns, (), shift, generated, fused, box, one.levels)
 
     def parameters_at(
         self,

@@ -28,6 +28,10 @@ class Encoding:
     columns: int
     fine: tuple[Float[Tensor, "b _ _ _"], ...] = ()
     """Finer maps of the encoder, for the second look at each object."""
+    shift: Float[Tensor, " b"] | None = None
+    """How unlike the images learnt from each is (`nolbo_ppl.models.image_shift`); None where the guide cannot tell."""
+    generated: Float[Tensor, " b"] | None = None
+    """Probability that each is a generated scene; None where the guide cannot tell."""
 
 
 @dataclass
@@ -71,6 +75,19 @@ class RegionParameters:
         likeliest = torch.nn.functional.one_hot(probability.argmax(-1), probability.shape[-1])
         shift = (likeliest - probability) @ prior_mean.to(probability.dtype)
         return dataclasses.replace(self, shape_loc=self.shape_loc + shift)
+
+    def widened(self, factor: Float[Tensor, "*n"]) -> RegionParameters:
+        """The same with every scale this many times as large, categories as much less certain."""
+        by = factor[..., None]
+        return dataclasses.replace(
+            self,
+            label_logits=self.label_logits / by,
+            shape_scale=self.shape_scale * by,
+            azimuth_natural=self.azimuth_natural / by[..., None] ** 2,
+            angle_scale=self.angle_scale * by,
+            box_scale=self.box_scale * by,
+            range_scale=self.range_scale * by,
+        )
 
     def map(self, function: Callable[[Tensor], Tensor]) -> RegionParameters:
         """Apply a function to every tensor."""

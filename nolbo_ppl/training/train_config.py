@@ -40,7 +40,7 @@ FREE_FIELDS = (
 """Fields a resumed run may change: they do not touch what is learnt."""
 NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False}
 """Fields that a checkpoint need not name where they have these values, for the same reason as `OPTIONAL_FIELDS`."""
-OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes", "evidence_scenes")
+OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes", "unlabelled", "evidence_scenes")
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
@@ -169,6 +169,9 @@ class TrainConfig:
     photographs: Path | None = None
     """Labelled photographs (COCO-style JSON), not trained on. A detector's evidence is fitted on every third, from the first; the
     finished model is measured on every third, from the second, as `nolbo evaluate --photographs FILE --part 1 3` does."""
+    unlabelled: Path | None = None
+    """Folder of photographs without labels. A model with a detector learns from them too what tells photographs from generated
+    scenes, and how unlike an image is to those it knows."""
     evidence_scenes: int = 1200
     """Scenes of each data set, at most, from which a model with a detector learns to weigh its evidence at the end."""
     checkpoint_every: int = 100

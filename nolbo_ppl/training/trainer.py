@@ -25,6 +25,7 @@ from nolbo_ppl.devices import device_of, placed
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.posterior.model_folder import load, save
 from nolbo_ppl.io.files import read_json_object, write_json
+from nolbo_ppl.io.images import images_of, open_image
 from nolbo_ppl.io.tensors import load_tensors, save_tensors
 from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.observation_model import Nolbo
@@ -33,6 +34,7 @@ from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.training.detector_file import adopt, adopt_features
+from nolbo_ppl.training.domain_fit import contexts_of, fit_domain, learn_sizes
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.photograph_fit import PARTS, PhotographFit, adopt_fit, find_objects, fit_found
@@ -156,8 +158,17 @@ def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dic
         return table
 
     train, held_out = gathered(False), gathered(True)
-    terms = fit_fusion(model, train, held_out, data.plain_generated(config.evidence_scenes), config.seed)  # on the CPU
-    return {f"evidence/{name}": value for name, value in terms.items()}
+    generated = data.plain_generated(config.evidence_scenes)
+    terms = fit_fusion(model, train, held_out, generated, config.seed)  # on the CPU
+    context = train.context
+    if config.unlabelled is not None:
+        images = (open_image(path) for path in sorted(images_of(config.unlabelled, recursive=True)))
+        more = contexts_of(guide, progress_bar(images, "unlabelled", "image"))
+        context, generated = torch.cat((context, more)), torch.cat((generated, torch.zeros(len(more), dtype=torch.bool)))
+    mixed = torch.randperm(len(context), generator=torch.Generator().manual_seed(config.seed))  # held-out ones of every source
+    figures = fit_domain(guide, context[mixed].to(data.device), generated[mixed].to(data.device))
+    learn_sizes(guide, model.config.categories, config.seed)
+    return {**{f"evidence/{name}": value for name, value in terms.items()}, **figures}
 
 
 def fit_photographs(model: Nolbo, config: TrainConfig) -> dict[str, Any]:

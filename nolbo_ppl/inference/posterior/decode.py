@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape
+from nolbo_ppl.inference.posterior.metric_size import MetricKnowledge, with_metric_size
 from nolbo_ppl.models.distributions import VonMisesMixture, kl_to_each_component
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
@@ -37,6 +38,8 @@ class SelectedRegions:
     """[fx, fy, cx, cy] of each one's image, px of the scaled image."""
     scale: Float[np.ndarray, "n 2"]
     """Width and height of that image over those of the given one."""
+    metric: MetricKnowledge | None = None
+    """What else tells their sizes and distances; None: the posterior alone."""
 
 
 def assemble(
@@ -67,6 +70,9 @@ def assemble(
     R = allocentric_to_egocentric(viewpoint_to_matrix(viewpoint), position)
     best = (azimuth.component_mean - viewpoint[:, :1]).cos().argmax(-1, keepdim=True)
     azimuth_variance = 1 / torch.gather(azimuth.concentration, -1, best)[:, 0].clamp_min(0.1)
+    if regions.metric is not None:
+        q = with_metric_size(q, box, position, diagonal, R, camera, regions.metric, config)
+        position, diagonal = decode_range(q.range_loc, box, camera, config)
     rotation_variance = (azimuth_variance + q.angle_scale.square().sum(-1)) / 3
     voxel_mean, voxel_variance, size = shapes(q, diagonal)
     return ObjectPosteriors(

@@ -22,6 +22,9 @@ from nolbo_ppl.models.posterior_calibration import Calibration
 FORMAT = 1
 """Format of a model's files, kept beside the tensors: a file of a later one is refused, not misread."""
 
+LEARNT_LATER = ("guide.shift.", "guide.sizes.")
+"""Statistics that models with a detector may lack."""
+
 
 def load(
     name_or_path: str | PathLike[str] = "photo", device: str | torch.device = "auto", *, half_precision: bool = False
@@ -66,6 +69,9 @@ def load(
     if stated is not None and stated != file_hash(weights):
         expected = f"SHA-256 {stated}, as config.json says"
         raise input_error("weights were changed", got=file_hash(weights), expected=expected, file=weights)
+    if config.detector:  # models of before these were: nothing is known of shifts and sizes
+        fresh = Nolbo.from_seed(config, seed=0).state_dict()
+        tensors = {**{name: value for name, value in fresh.items() if name.startswith(LEARNT_LATER)}, **tensors}
     with torch.device("meta"):  # shapes alone: a configuration of networks beyond any memory does not fit its weights
         check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
     model = Nolbo.from_seed(config, seed=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -19,9 +20,12 @@ from nolbo_ppl.geometry.boxes import boxes_in_image, suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
 from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape, decode_latents, extents, sampled_shapes
 from nolbo_ppl.inference.posterior.folded_networks import FoldedNetworks
+from nolbo_ppl.inference.posterior.metric_size import MetricKnowledge, shape_hulls
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
 from nolbo_ppl.inference.posterior.preprocess import PreprocessedImage, preprocess_all, same_shape
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guessed_intrinsics
+from nolbo_ppl.models.hybrid_guide import HybridGuide
+from nolbo_ppl.models.image_shift import ODDS_PER_SHIFT, SCALE_PER_SHIFT, excess
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import Encoding, RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
@@ -203,17 +207,23 @@ class ObservationModel:
         results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
             encoding = self.encode(torch.stack([prepared[i].image for i in group]))
+            shift = None if encoding.shift is None else encoding.shift.cpu()
             logit = self.calibration.objectness(encoding.objectness_logit.cpu())
+            if shift is not None:
+                logit = logit - ODDS_PER_SHIFT * excess(shift)[:, None]
             row, region, odds, look_at = find(encoding, logit, group)
             camera = torch.stack([prepared[i].camera for i in group])[row]
             scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
-            regions = SelectedRegions(
-                self._parameters(encoding, row, region, look_at), region, encoding.columns, odds, camera, scale
-            )
+            q = self._parameters(encoding, row, region, look_at)
+            if shift is not None:
+                q = q.widened(1 + SCALE_PER_SHIFT * excess(shift)[row])
+            known = self._metric_knowledge(encoding, row, [prepared[i] for i in group])
+            regions = SelectedRegions(q, region, encoding.columns, odds, camera, scale, known)
             answer = assemble(regions, self.config, self._prior, self._prior_mean, shapes)
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
             for k, i in enumerate(group):
-                results[i] = answer[slice(ends[k], ends[k + 1])]
+                one = answer[slice(ends[k], ends[k + 1])]
+                results[i] = one if shift is None else replace(one, shift=float(shift[k]))
         return [results[i] for i in range(len(prepared))]
 
     def _shapes(self, decode: bool, samples: int, seed: int) -> Callable[[RegionParameters, Tensor], DecodedShape]:
@@ -227,6 +237,21 @@ class ObservationModel:
             return sampled_shapes(self._decoded, side, q.shape_loc, q.shape_scale, metres, samples, seed)
 
         return shapes
+
+    def _metric_knowledge(
+        self, encoding: Encoding, row: Int[Tensor, " n"], images: Sequence[PreprocessedImage]
+    ) -> MetricKnowledge | None:
+        """What else tells sizes and distances of objects in these images; None for models that know no photographs."""
+        guide = self._networks.guide
+        if encoding.generated is None or not isinstance(guide, HybridGuide):
+            return None
+        return MetricKnowledge(
+            self._shape_hulls,
+            guide.sizes if self.device.type == "cpu" else copy.deepcopy(guide.sizes).cpu(),
+            1 - encoding.generated.cpu()[row],
+            torch.tensor([image.guessed for image in images])[row],
+            torch.tensor([image.extent for image in images])[row],
+        )
 
     def _preprocess_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[PreprocessedImage]:
         return preprocess_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
@@ -268,6 +293,11 @@ class ObservationModel:
         kept = kept[torch.argsort(probability[kept], descending=True, stable=True)]
         kept = kept[torch.argsort(row[kept], stable=True)]
         return row[kept], region[kept], torch.logit(probability[kept])
+
+    @cached_property
+    def _shape_hulls(self) -> Float[Tensor, "labels p 3"]:
+        """Points on the hull of each category's mean shape, in diagonals."""
+        return torch.as_tensor(shape_hulls(self.decode(self.prior_mean())), dtype=self._prior_mean.dtype)
 
     @cached_property
     def _category_extents(self) -> Float[np.ndarray, "labels 3"]:

@@ -33,6 +33,10 @@ class PreprocessedImage:
     """[fx, fy, cx, cy], px of the scaled image."""
     scale: Float[np.ndarray, " 2"]
     """Width and height of the scaled image over those of the given one."""
+    extent: tuple[int, int]
+    """Width and height of the scaled image without its bars, px."""
+    guessed: bool = False
+    """The camera is a guess."""
 
 
 def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 4"]:
@@ -45,7 +49,7 @@ def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "
 def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> PreprocessedImage:
     """Scale an image uniformly so that its longer side has the wanted size; grey bars make both multiples of 32.
 
-    The rule of training (`nolbo_ppl.data.folder.letterbox`), with bars on the right and below, so that pixels keep their place.
+    The rule of training (`nolbo_ppl.data.dataset_folder.letterbox`), with bars on the right and below: pixels keep their place.
 
     Args:
         image: see `Image`.
@@ -81,7 +85,8 @@ def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torc
     if any(bars):
         image = np.pad(image, ((0, bars[1]), (0, bars[0]), (0, 0)), constant_values=PADDING)
     tensor = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
-    return PreprocessedImage(tensor, torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype), scale)
+    scaled = torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype)
+    return PreprocessedImage(tensor, scaled, scale, (new[0], new[1]), guessed=intrinsics is None)
 
 
 def preprocess_all(
