@@ -20,9 +20,20 @@ import tyro
 from scipy.stats import beta
 
 from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_circuit, simulate_sequence
-from nolbo_ppl.geometry.pose import relative, se3_log, so3_exp, so3_log
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
+from nolbo_ppl.evaluation.map_calibration import (
+    Cases,
+    association_cases,
+    background_cases,
+    class_cases,
+    existence_cases,
+    landmark_regions,
+    pose_regions,
+)
+from nolbo_ppl.geometry.pose import make_pose
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.io.files import read_json, write_json
+from nolbo_ppl.io.true_objects import TrueObjects
+from nolbo_ppl.metrics.stated_probabilities import log_score, reliability_bins, reliability_gap
 
 MIN_IN_BIN = 50
 """Bins of reliability with fewer cases are joined to the next."""
@@ -89,25 +100,9 @@ def simulate(kind: Kind, seed: int) -> SimulatedSequence:
     return replace(drive, observations=table)
 
 
-def object_of_landmarks(result: SlamResult, drive: SimulatedSequence) -> tuple[np.ndarray, np.ndarray]:
-    """True object of each landmark (-1: none), the one most of its associations are of; and the share that is real."""
-    found, m = result.associations, len(result.state.static)
-    objects = len(drive.world.position) if drive.world is not None else 0
-    votes = np.zeros((m, objects + 1))
-    np.add.at(votes, (found.landmark, drive.object_of[found.row]), found.weight)
-    owner = np.argmax(votes, axis=1)
-    return np.where(owner == objects, -1, owner), 1 - votes[:, -1] / np.maximum(votes.sum(axis=1), 1e-9)
-
-
-def case(stated: np.ndarray, happened: np.ndarray) -> list[list[float]]:
-    """Pairs of a stated probability and what happened."""
-    return [[round(float(p), 6), float(y)] for p, y in zip(stated, happened)]
-
-
-def log_score(stated: np.ndarray, happened: np.ndarray) -> float:
-    """Mean log loss, nats."""
-    p = np.clip(stated, 1e-6, 1 - 1e-6)
-    return float(-np.mean(np.where(happened, np.log(p), np.log1p(-p))))
+def case(cases: Cases) -> list[list[float]]:
+    """Pairs of a stated probability and what happened, for the file."""
+    return [[round(float(p), 6), float(y)] for p, y in zip(*cases)]
 
 
 def measure(kind: Kind, seed: int) -> dict[str, Any]:
@@ -118,88 +113,24 @@ def measure(kind: Kind, seed: int) -> dict[str, Any]:
         SlamProblem(drive.odometry, drive.observations), SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
     )
     row: dict[str, Any] = {"seconds": time.process_time() - start}
-    found, landmarks = result.associations, result.landmarks
-    false = drive.object_of < 0
-    owner, real = object_of_landmarks(result, drive)
-    row["background"] = case(found.background, false)
-    row["log_score"] = log_score(found.background, false)
-    row["log_score_objectness"] = log_score(1 - drive.observations.objectness, false)
-    row["existence"] = case(np.array([x.existence for x in landmarks]), real > 0.5)
-    row["landmarks"] = len(landmarks) / max(len(np.unique(drive.object_of[~false])), 1)
-    row["class"] = [
-        [
-            max(x.class_posterior.values()),
-            float(max(x.class_posterior, key=x.class_posterior.__getitem__) == f"c{drive.world.category[o]}"),
-        ]
-        for x, o in zip(landmarks, owner)
-        if o >= 0 and drive.world is not None and x.class_posterior
-    ]
-    row["association"], row["association_few"] = associations(result, drive)
-    row |= calibrated_errors(result, drive, owner)
-    return row
-
-
-def associations(result: SlamResult, drive: SimulatedSequence) -> tuple[list[list[float]], list[list[float]]]:
-    """Stated probability of every listed pair and whether the detection's object is that of the landmark's other detections;
-    all, and those of landmarks with two or three detections."""
-    found = result.associations
-    hits = np.bincount(found.landmark, found.weight, minlength=len(result.state.static))
-    everything, few = [], []
-    for j in range(len(hits)):
-        mine = np.flatnonzero(found.landmark == j)
-        for p in mine:
-            others = mine[mine != p]
-            if not len(others):
-                continue
-            objects, inverse = np.unique(drive.object_of[found.row[others]], return_inverse=True)
-            most = objects[np.argmax(np.bincount(inverse, found.weight[others]))]
-            pair = [round(float(found.weight[p]), 6), float(most >= 0 and drive.object_of[found.row[p]] == most)]
-            everything.append(pair)
-            if 1.5 < hits[j] < 3.5 and pair[0] > 0.5:
-                few.append(pair)
-    return everything, few
-
-
-def calibrated_errors(result: SlamResult, drive: SimulatedSequence, owner: np.ndarray) -> dict[str, float]:
-    """Normalised squared errors a degree of freedom of poses, and of positions, orientations, latents of real landmarks."""
-    rows = np.arange(5, len(drive.truth), 5)
-    error = se3_log(relative(result.T_world_camera[rows], drive.truth[rows]))
-    covariance = result.pose_covariances(rows)
-    out = {"nees_pose": float(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)) / 6)}
-    position, orientation, latent = [], [], []
-    world = drive.world
+    of, world = drive.object_of, drive.world
     assert world is not None
-    for x, o in zip(result.landmarks, owner):
-        if o < 0:
-            continue
-        e = x.T_world_object[:3, 3] - world.position[o]
-        position.append(e @ np.linalg.solve(x.position_covariance, e) / 3)
-        if x.oriented:
-            R = x.T_world_object[:3, :3].T @ world.rotation[o]
-            turned = [so3_log(R), so3_log(R @ so3_exp(np.array([0.0, 0.0, np.pi])))]
-            e = min(turned, key=lambda v: float(v @ v))
-            orientation.append(e @ np.linalg.solve(x.covariance[:3, :3], e) / 3)
-        if x.latent is not None and x.latent_variance is not None:
-            latent.append(float(np.mean((x.latent - world.latent[o]) ** 2 / x.latent_variance)))
-    for name, values in (("position", position), ("orientation", orientation), ("latent", latent)):
-        if values:
-            out[f"nees_{name}"] = float(np.mean(values))
-    return out
-
-
-def reliability_gap(cases: np.ndarray, bins: int = 10) -> tuple[float, list[tuple[float, float, int]]]:
-    """Largest distance of the stated mean from the share that happened over bins of `MIN_IN_BIN` cases, and the bins."""
-    edges = np.linspace(0, 1, bins + 1)
-    which = np.clip(np.searchsorted(edges, cases[:, 0], side="right") - 1, 0, bins - 1)
-    table, rest = [], np.zeros((0, 2))
-    for b in range(bins):
-        rest = np.concatenate([rest, cases[which == b]])
-        if len(rest) >= MIN_IN_BIN:
-            table.append((float(rest[:, 0].mean()), float(rest[:, 1].mean()), len(rest)))
-            rest = np.zeros((0, 2))
-    if len(rest) and not table:
-        table.append((float(rest[:, 0].mean()), float(rest[:, 1].mean()), len(rest)))
-    return max((abs(p - y) for p, y, _ in table), default=float("nan")), table
+    category = tuple(f"c{k}" for k in world.category)
+    objects = TrueObjects(of, make_pose(world.rotation, world.position), category, world.latent)
+    background, false = background_cases(result, of)
+    row["background"] = case((background, false))
+    row["log_score"] = log_score(background, false > 0.5)
+    row["log_score_objectness"] = log_score(1 - drive.observations.objectness, false > 0.5)
+    row["existence"] = case(existence_cases(result, of))
+    row["landmarks"] = len(result.landmarks) / max(len(np.unique(of[of >= 0])), 1)
+    row["class"] = case(class_cases(result, of, category))
+    row["association"] = case(association_cases(result, of))
+    row["association_few"] = case(association_cases(result, of, few=True))
+    regions = {"pose": pose_regions(result, drive.truth, every=5), **landmark_regions(result, objects, np.eye(4))}
+    for name, found in regions.items():
+        if len(found.squared):
+            row[f"nees_{name.removeprefix('landmark_')}"] = float(found.squared.mean() / found.degrees)
+    return row
 
 
 def interval(rows: list[dict[str, Any]], figure: Callable[[list[dict[str, Any]]], float], resamples: int = 200) -> str:
@@ -238,8 +169,10 @@ def table(name: str, rows: list[dict[str, Any]]) -> None:
     print(f"  background, log score         {interval(rows, mean_of('log_score'))}")
     print(f"    less that of objectness     {interval(rows, difference)}")
     for which in ("background", "existence", "class", "association"):
-        gap, bins = reliability_gap(pooled(rows, which))
-        print(f"  {which}, largest gap {gap:.3f}: " + " ".join(f"{p:.2f}>{y:.2f}({n})" for p, y, n in bins))
+        cases = pooled(rows, which)
+        bins = reliability_bins(cases[:, 0], cases[:, 1] > 0.5)
+        shown = " ".join(f"{b.stated:.2f}>{b.happened:.2f}({b.count})" for b in bins)
+        print(f"  {which}, largest gap {reliability_gap(bins):.3f}: {shown}")
     middle = pooled(rows, "existence")
     middle = middle[(middle[:, 0] > 0.1) & (middle[:, 0] < 0.9)]
     stated, real = (middle[:, 0].mean(), middle[:, 1].mean()) if len(middle) else (np.nan, np.nan)

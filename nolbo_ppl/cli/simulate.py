@@ -197,6 +197,8 @@ def run(config: SimulateConfig) -> SimulatedSequence:
         objects=tuple(None if k < 0 else f"o{k}" for k in drive.object_of),
         trusted=np.ones(len(drive.truth), dtype=bool),
         T_world_object={f"o{k}": pose for k, pose in enumerate(poses)},
+        categories={f"o{k}": f"c{c}" for k, c in enumerate(drive.world.category)} if drive.world.latent.shape[1] else {},
+        latents={f"o{k}": z for k, z in enumerate(drive.world.latent) if len(z)},
         source={"simulated": {**asdict(config), "out": None, "trajectory": str(config.trajectory or "") or None}},
     )
     with output_folder(config.out, RESULT, is_own=is_simulated, inputs=(config.trajectory,)) as folder:

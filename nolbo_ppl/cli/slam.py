@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from nolbo_ppl._moved import renamed
+from nolbo_ppl.evaluation.map_calibration import map_calibration
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import RESULT, is_result, write_result
 from nolbo_ppl.io.observations import read_observations
@@ -17,6 +18,7 @@ from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
 from nolbo_ppl.io.trajectories import TIME_TOLERANCE, Trajectory, read_covariance, read_frame_poses, read_trajectory
 from nolbo_ppl.io.trajectory_tables import TableFormat
+from nolbo_ppl.io.true_objects import read_true_objects
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,9 @@ class SlamRunConfig:
     truth: Path | None = None
     """True trajectory, for errors before and after: matched by time where both have times, else row by row. Frames without
     truth, and rows of nothing but nan or inf, are left out of the errors."""
+    truth_objects: Path | None = None
+    """True objects (objects.json of `nolbo simulate` or `nolbo convert`): what the map states is then compared with them, in
+    summary.json and the report."""
     odometry_format: TableFormat | None = None
     """Format of the odometry, where it is not to be told from the file."""
     truth_format: TableFormat | None = None
@@ -63,7 +68,13 @@ def run(arguments: SlamRunConfig) -> tuple[SlamResult, dict[str, object]]:
         NolboError: bad input, an output folder that holds something else, or a graph that cannot be solved; an older result
             stays as it was.
     """
-    inputs = (arguments.odometry, arguments.observations, arguments.odometry_covariance, arguments.truth)
+    inputs = (
+        arguments.odometry,
+        arguments.observations,
+        arguments.odometry_covariance,
+        arguments.truth,
+        arguments.truth_objects,
+    )
     with output_folder(arguments.out, RESULT, is_own=is_result, inputs=inputs) as folder:
         return _solve(arguments, folder)
 
@@ -85,6 +96,7 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
         truth, remarks = found.T_world_camera, found.remarks()
     covariance = None if arguments.odometry_covariance is None else read_covariance(arguments.odometry_covariance)
     problem = SlamProblem(odometry.T_world_camera, table, covariance)
+    objects = None if arguments.truth_objects is None else read_true_objects(arguments.truth_objects, table.id)
     model = None
     if arguments.model is not None:
         from nolbo_ppl.inference.posterior.model_folder import load
@@ -99,7 +111,8 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
         result = solve(problem, config)
     from nolbo_ppl.viz.map_plots import draw_slam_result
 
-    report = write_result(folder, result, odometry, truth, model=model)
+    stated = None if truth is None and objects is None else map_calibration(result, truth, objects)
+    report = write_result(folder, result, odometry, truth, model=model, calibration=stated)
     draw_slam_result(folder / "map.png", odometry.T_world_camera, result, truth)
     if arguments.mcap:
         corrected = Trajectory(result.T_world_camera, odometry.times)

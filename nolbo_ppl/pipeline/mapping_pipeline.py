@@ -14,6 +14,7 @@ import numpy as np
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.evaluation.map_calibration import map_calibration
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
@@ -125,7 +126,9 @@ class ObjectMappingPipeline:
         for text in result.state.noise.warnings:
             LOG.warning("%s", text)
         write_noise(self.run.slam / "noise.npz", result.state.noise)
-        write_result(self.run.slam, result, Trajectory(problem.odometry), self.run.truth_given, model=self.model)
+        truth = self.run.truth_given
+        stated = None if truth is None else map_calibration(result, truth)
+        write_result(self.run.slam, result, Trajectory(problem.odometry), truth, model=self.model, calibration=stated)
         draw_slam_result(self.run.slam / "map.png", problem.odometry, result, self.run.truth_given)
 
     def map(self) -> None:

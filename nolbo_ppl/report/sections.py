@@ -7,6 +7,7 @@ import shlex
 import numpy as np
 
 from nolbo_ppl.io.run_folder import RunFolder
+from nolbo_ppl.report.calibration_section import calibration
 from nolbo_ppl.report.em_section import em_slider, iteration_table
 from nolbo_ppl.report.gallery import gallery
 from nolbo_ppl.report.loop_section import find_loops, is_right, loop_gap, loop_scores
@@ -203,6 +204,7 @@ SECTIONS = (
     ("loops", "Loop closures", loop_closures),
     ("association", "Association", association),
     ("landmarks", "Landmarks", landmarks),
+    ("calibration", "Stated and true", calibration),
     ("em", "EM, iteration by iteration", iterations),
     ("figures", "Figures", figures),
     ("how", "How it was run", how),

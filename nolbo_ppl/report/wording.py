@@ -34,7 +34,7 @@ TITLES = {
     "observation_scores": "Observations against the truth",
 }
 """Parts of a summary whose name alone would not say what they are."""
-SETTINGS = ("configuration", "versions", "iterations", "warnings", "noise", "fingerprints", "complete")
+SETTINGS = ("configuration", "calibration", "versions", "iterations", "warnings", "noise", "fingerprints", "complete")
 """Parts of a summary that are not figures."""
 
 

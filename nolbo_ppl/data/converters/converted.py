@@ -33,6 +33,10 @@ class Converted:
     """Rows whose truth can be relied on."""
     T_world_object: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """True poses of static objects, where known."""
+    categories: dict[str, str] = field(default_factory=dict)
+    """Categories of objects, where known."""
+    latents: dict[str, Float[np.ndarray, " d"]] = field(default_factory=dict)
+    """Shape latents of objects, where known."""
     odometry_covariance: Float[np.ndarray, "n-1 6 6"] | None = None
     """Covariance of every odometry step, where it is known (see `SlamProblem`)."""
     source: dict[str, Any] = field(default_factory=dict)
@@ -49,12 +53,14 @@ def write_converted(out: str | PathLike[str], data: Converted) -> None:
     if data.odometry_covariance is not None:
         save_npz(out / COVARIANCE, {"covariance": data.odometry_covariance})
     write_observations(out / "observations.jsonl", data.observations)
+    known = {"categories": data.categories, "latents": {k: v.tolist() for k, v in data.latents.items()}}
     write_json(
         out / "objects.json",
         {
             "objects": dict(zip(data.observations.id, data.objects)),
             "trusted": [bool(x) for x in data.trusted],
             "T_world_object": {k: v.tolist() for k, v in data.T_world_object.items()},
+            **{name: values for name, values in known.items() if values},
         },
     )
     write_json(out / "source.json", data.source)

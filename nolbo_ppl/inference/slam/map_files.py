@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
@@ -109,6 +110,7 @@ def write_result(
     odometry: Trajectory,
     truth: np.ndarray | None = None,
     model: LatentDecoder | None = None,
+    calibration: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write every file into `out`, each atomically, the summary last; returns the summary.
 
@@ -118,6 +120,7 @@ def write_result(
         odometry: the input, for its format and times.
         truth: true poses of the same rows, for errors.
         model: decodes the landmarks' latents into `landmarks_voxels.npz`.
+        calibration: what the map states beside the truth (`evaluation.map_calibration`), for the summary.
 
     Raises:
         InputError: the latents do not have the model's dimension; nothing is written.
@@ -135,6 +138,6 @@ def write_result(
     write_landmarks(out / "landmarks.json", result.landmarks)
     names = [landmark.name for landmark in result.landmarks]
     write_associations(out / "associations.jsonl", association_table(result), names)
-    report = summary(result, truth)
+    report = summary(result, truth) | ({"calibration": dict(calibration)} if calibration else {})
     write_json(out / "summary.json", report)
     return report

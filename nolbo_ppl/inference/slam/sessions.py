@@ -315,9 +315,9 @@ def solve_sessions(problems: Sequence[SlamProblem], config: SlamConfig | None = 
 
     Example:
         >>> import nolbo_ppl
-        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_drive
+        >>> from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
         >>> rng = np.random.default_rng(0)
-        >>> drive = simulate_drive(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
+        >>> drive = simulate_sequence(simulate_circuit(rng, frames_per_lap=30), rng, world=WorldConfig(objects=15))
         >>> seen, half = drive.observations, len(drive.odometry) // 2
         >>> parts = [
         ...     nolbo_ppl.SlamProblem(drive.odometry[:half], seen.select(seen.frame < half)),
