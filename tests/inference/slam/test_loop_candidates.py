@@ -153,9 +153,9 @@ def test_windows_hold_every_tracklet() -> None:
         assert (np.diff(first[window]) == 1).all()  # neighbours in time
 
 
-def links(a: list[int], b: list[int], weight: list[float]) -> LandmarkEqualities:
+def links(a: list[int], b: list[int], weight: list[float], scale: float = 1.0) -> LandmarkEqualities:
     return LandmarkEqualities(
-        np.array(a), np.array(b), np.array(weight), np.tile(np.eye(4), (len(a), 1, 1)), np.ones((len(a), 2))
+        np.array(a, int), np.array(b, int), np.array(weight), np.tile(np.eye(4), (len(a), 1, 1)), np.full((len(a), 2), scale)
     )
 
 
@@ -205,3 +205,51 @@ def test_a_link_does_not_speak_for_itself() -> None:
     position[3, 0] = 2.0
     found_information = link_information(joined, poses(position), 1.5, np.array([3, 4, 4]), np.array([1, 0, 2]))
     np.testing.assert_allclose(found_information, [0.8 / (1 + 0.8 * 4 / 1.5**2), 0.5, 0.0])
+
+
+def test_tracklets_seen_together_are_judged_by_their_joint_density() -> None:
+    """Three gaps that share their drift: each judged in the graph that holds the links of the others.
+
+    Link after link, the densities multiply to the joint one (the chain rule); with all links in the graph each is the density
+    given all others. Both by dense algebra of the joint Gaussian.
+    """
+    rng = np.random.default_rng(7)
+    count, floor, shared = 20000, 0.3, 2.0
+    own = np.kron(np.diag([0.2, 0.3, 0.1]), np.eye(3))
+    K = shared * np.kron(np.ones((3, 3)), np.eye(3)) + own
+    gap = (np.array([1.6, -0.8, 0.4]) + 0.3 * rng.standard_normal((3, 3))).ravel()
+    config = SlamConfig(robust_width=1e6)
+
+    def judged(linked: list[int]) -> np.ndarray:
+        """Log densities of the three gaps in the graph with these links."""
+        information = np.repeat(np.isin(np.arange(3), linked) / floor**2, 3)
+        after = np.linalg.inv(np.linalg.inv(K) + np.diag(information))
+        mean = after @ np.linalg.solve(K, gap)
+        position = np.zeros((6, 3))
+        position[:3, 0] = 30.0 * np.arange(3)
+        position[3:] = position[:3] + mean.reshape(3, 3)
+        deviation = np.zeros((6, 3, count))
+        deviation[3:] = (np.linalg.cholesky(after) @ rng.standard_normal((9, count))).reshape(3, 3, count)
+        found = candidate_pairs(
+            poses(position),
+            PosteriorSamples(deviation, np.zeros_like(deviation)),
+            features(6, first=np.array([0, 0, 0, 50, 50, 50])),
+            PRIOR,
+            config,
+            inflation=1.0,
+            floor=floor,
+            links=links([3 + i for i in linked], linked, [1.0] * len(linked), floor),
+        )
+        assert found.a.tolist() == [3, 4, 5] and found.b.tolist() == [0, 1, 2]
+        return np.asarray(found.log_position)
+
+    total = K + floor**2 * np.eye(9)
+    joint = multivariate_normal(np.zeros(9), total).logpdf(gap)
+    chain = sum(judged(list(range(i)))[i] for i in range(3))
+    assert chain == pytest.approx(joint, abs=0.1)
+    assert abs(judged([]).sum() - joint) > 1.0  # the marginals, multiplied, say something else
+    given_others = judged([0, 1, 2])
+    for i in range(3):
+        others = np.delete(np.arange(9), slice(3 * i, 3 * i + 3))
+        rest = multivariate_normal(np.zeros(6), total[np.ix_(others, others)]).logpdf(gap[others])
+        assert given_others[i] == pytest.approx(joint - rest, abs=0.1)
