@@ -26,8 +26,8 @@ from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 SPREAD = 0.1
 """Errors that differ by more than this between seeds are different answers, m."""
 AT_TRUTH = 0.5
-"""A hypothesis closer to the map of true associations than this is that map, m (or than half the odometry's distance to it)."""
-ROTATION, RATIO = 0.03, 0.05
+"""A hypothesis whose trajectory is closer to that of the true associations than this share of the odometry's distance is that map."""
+ROTATION, RATIO = 0.02, 0.05
 """Scales of the odometry: rad a step, m per m."""
 
 
@@ -46,13 +46,13 @@ class Arguments:
 
 
 def simulate(seed: int) -> SimulatedSequence:
-    """Two laps round at most ten objects of one kind, without orientation or latent, one or two a frame; loose odometry."""
+    """Two laps round 24 objects of one kind, without orientation or latent, one or two seen a frame; loose odometry."""
     random = np.random.default_rng(seed)
     truth = simulate_circuit(random, laps=2, radius=12.0, frames_per_lap=36)
     return simulate_sequence(
         truth,
         random,
-        world=WorldConfig(objects=10, categories=1, latent_dim=0, instance_scale=0.0),
+        world=WorldConfig(objects=24, categories=1, latent_dim=0, instance_scale=0.0),
         detector=DetectorConfig(maximum_range=12.0, rotation_scale=None, clutter_rate=0.3),
         odometry_rotation_scale=ROTATION,
         odometry_translation_ratio=RATIO,
@@ -92,9 +92,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     depend = [max(r["ate"] for r in row["runs"]) - min(r["ate"] for r in row["runs"]) > SPREAD for row in rows]
     unsaid = [d and not any(r["ambiguous"] for r in row["runs"]) for d, row in zip(depend, rows)]
     runs = [(row, r) for row in rows for r in row["runs"]]
-    missing = [min(r["distances"], default=np.inf) > min(AT_TRUTH, 0.5 * row["odometry_to_oracle"]) for row, r in runs]
+    missing = [min(r["distances"], default=np.inf) > AT_TRUTH * row["odometry_to_oracle"] for row, r in runs]
     worse = [r["ate"] > 1.05 * row["odometry"] for row, r in runs]
-    right = np.array([r["distances"][0] <= min(AT_TRUTH, 0.5 * row["odometry_to_oracle"]) for row, r in runs])
+    right = np.array([r["distances"][0] <= AT_TRUTH * row["odometry_to_oracle"] for row, r in runs])
     stated = np.array([r["weights"][0] for _, r in runs])
     lines = [
         f"worlds {len(rows)}, runs {len(runs)}",

@@ -62,7 +62,11 @@ def existence_log_odds(
     score = model.log_score_ratio(seen)[k] * mean_score(model, hits)[j]
     safe = np.clip(weight, 1e-12, 1 - 1e-12)
     entropy = -safe * np.log(safe) - (1 - safe) * np.log1p(-safe)
-    value = np.bincount(j, weight * (pairs.log_residual + score - log_clutter) + entropy, minlength=m).astype(np.float64)
+    # What placed the landmark lies about it by the sensor's covariance, the place integrated out below. What did not is
+    # predicted: the map's own uncertainty is part of its gap, and it says nothing of the place yet.
+    inside = np.minimum(weight, pairs.member)
+    log_position = inside * pairs.log_residual + (weight - inside) * pairs.log_position
+    value = np.bincount(j, log_position + weight * (score - log_clutter) + entropy, minlength=m).astype(np.float64)
     # Each ratio is that of one detection given all others; of n in a row, the first has none before it.
     value += np.bincount(j, weight * pairs.log_feature, minlength=m) * np.maximum(hits - 1, 0) / np.maximum(hits, 1)
     log_object = model.log_objects(seen, log_density)[k] - np.log(probability)
@@ -70,7 +74,8 @@ def existence_log_odds(
     information = np.tile(1e-9 * np.eye(3), (m, 1, 1))
     R = state.estimate.T_world_camera[seen.frame[k], :3, :3]
     # What hardly any detection speaks for is as large as one detection: else its volume, and its odds, would be without bound.
-    whole = weight / np.clip(hits, 1e-12, 1.0)[j]
+    placed = np.bincount(j, inside, minlength=m)
+    whole = np.where(placed[j] > 1e-6, inside / np.clip(placed, 1e-12, 1.0)[j], weight / np.clip(hits, 1e-12, 1.0)[j])
     np.add.at(information, j, whole[:, None, None] * (R @ np.linalg.inv(seen.covariance[k]) @ np.swapaxes(R, 1, 2)))
     value += 1.5 * np.log(2 * np.pi) - 0.5 * np.linalg.slogdet(information)[1]
     number, mean = exposures.totals(model)

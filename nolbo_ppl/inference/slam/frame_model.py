@@ -30,6 +30,11 @@ PROBABILITY_LIMITS = (0.02, 0.97)
 """Detection probabilities stay within these: a detector is never sure."""
 CONCENTRATIONS = np.array([2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0])
 """Values tried for how alike objects are in their detection probability (of a beta distribution)."""
+SHARE_COUNT = 20.0
+"""Weight of the share of false detections that objectness states, in detections: a small drive has no other anchor."""
+OFFSET_SCALE = 0.7
+"""Standard deviation of the prior on the score's constant: calibrated objectness has none. Without it the share of false
+detections and the constant drive each other on: all of a drive of 40 detections became clutter, 19 true ones at 0.9 with it."""
 SLOPE_SCALE = 0.5
 """Standard deviation of the prior on the log of the score's slope: calibrated objectness has slope 1."""
 
@@ -54,6 +59,8 @@ class FrameModel:
     """Share of false detections by range."""
     detection_probability: Float[np.ndarray, "r a"]
     """Probability that an object in a cell is detected."""
+    stated_share: float = 0.1
+    """Share of false detections by the stated objectness."""
     concentration: float = 16.0
     """How alike objects are: detection probabilities of objects are beta with this total count."""
     unmapped: float = 1.0
@@ -205,6 +212,7 @@ def initial_frame_model(measurements: Measurements, config: SlamConfig, frames: 
         elevation_limits=(float(bottom), float(top)),
         clutter_share=np.full(RANGES, np.clip(false, 0.01, 0.9)),
         detection_probability=np.full((RANGES, AZIMUTHS), 0.7),
+        stated_share=float(np.clip(false, 0.01, 0.9)),
         clutter_rate=config.clutter_rate,
         new_rate=config.new_rate,
     )
@@ -254,7 +262,7 @@ def estimate_frame_model(
     probability = np.clip((hit + PRIOR_COUNT * prior) / (seen + PRIOR_COUNT), *PROBABILITY_LIMITS)
     which = model.range_cell(measurements.position)
     count = np.bincount(which, minlength=RANGES)
-    overall = (background.sum() + 0.5) / (len(background) + 1.0)
+    overall = (background.sum() + SHARE_COUNT * model.stated_share) / (len(background) + SHARE_COUNT)
     share = (np.bincount(which, background, minlength=RANGES) + PRIOR_COUNT * overall) / (count + PRIOR_COUNT)
     slope, offset = _fit_score(model, measurements, background, overall)
     model = replace(
@@ -296,22 +304,26 @@ def _fit_score(model: FrameModel, measurements: Measurements, background: np.nda
     """Slope and constant of the score's log likelihood ratio: logistic regression on the marginals, by Newton's method.
 
     The density ratio of scores is an exponential tilt, so that the posterior given the score alone is logistic in its
-    log odds. The log of the slope has a normal prior about 0: calibrated objectness has slope 1.
+    log odds. The log of the slope and the constant have normal priors about 0: calibrated objectness has slope 1 and no constant.
     """
     x = measurements.log_object - measurements.log_clutter
     if len(x) < 30 or np.ptp(x) < 1e-6:
         return 1.0, 0.0
     y = 1.0 - background
-    log_slope, constant = np.log(model.score_slope), model.score_offset + np.log((1 - clutter) / clutter)
+    base = float(np.log((1 - clutter) / clutter))
+    log_slope, constant = np.log(model.score_slope), model.score_offset + base
     for _ in range(20):
         slope = np.exp(log_slope)
         p = expit(slope * x + constant)
         residual, curvature = y - p, p * (1 - p) + 1e-9
-        gradient = np.array([slope * (residual @ x) - log_slope / SLOPE_SCALE**2, residual.sum()])
+        gradient = np.array(
+            [slope * (residual @ x) - log_slope / SLOPE_SCALE**2, residual.sum() - (constant - base) / OFFSET_SCALE**2]
+        )
         a, b, c = slope**2 * (curvature @ x**2) + 1 / SLOPE_SCALE**2, slope * (curvature @ x), curvature.sum()
+        c += 1 / OFFSET_SCALE**2
         step = np.linalg.solve(np.array([[a, b], [b, c]]) + 1e-9 * np.eye(2), gradient)
         step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
         log_slope, constant = float(np.clip(log_slope + step[0], -3, 3)), float(constant + step[1])
         if np.abs(step).max() < 1e-6:
             break
-    return float(np.exp(log_slope)), constant - float(np.log((1 - clutter) / clutter))
+    return float(np.exp(log_slope)), constant - base
