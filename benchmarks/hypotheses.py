@@ -26,7 +26,7 @@ from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 SPREAD = 0.1
 """Errors that differ by more than this between seeds are different answers, m."""
 AT_TRUTH = 0.5
-"""A hypothesis whose trajectory is closer to that of the true associations than this share of the odometry's distance is that map."""
+"""A hypothesis closer to the trajectory of the true associations than this share of the odometry's distance is that map."""
 ROTATION, RATIO = 0.02, 0.05
 """Scales of the odometry: rad a step, m per m."""
 

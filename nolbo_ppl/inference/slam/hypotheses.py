@@ -147,8 +147,8 @@ def agree(first: Run, second: Run, distance: float, same: float) -> bool:
 
     Two that closed no loop agree on nothing: that neither found one is no evidence that there is none.
 
-    The evidence of two that did need not agree: scales of the noise that settled a few percent apart move it by a hundred nats on a
-    drive whose maps no eye could tell apart.
+    The evidence of two that did need not agree: scales of the noise that settled a few percent apart move it by a hundred
+    nats on a drive whose maps no eye could tell apart.
     """
     if not (first.closed and second.closed):
         return False
