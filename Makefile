@@ -11,7 +11,7 @@ FUZZ_SECONDS ?= 600
 # Kills, signals and full disks of `make faults`.
 FAULTS ?= 100
 
-.PHONY: setup demo train test test-shapes lint wheel bench bench-gate docs clean fuzz faults test-lowest test-newest audit
+.PHONY: setup demo train test lint wheel bench bench-gate docs clean fuzz faults test-lowest test-newest audit
 
 setup: $(STAMP)
 
@@ -28,10 +28,6 @@ train: $(STAMP)
 
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_WORKERS)
-
-# The shapes and dtypes of annotations, checked at every call (what is refused is refused by the check). The rooms named here are right; a next one is added when it is.
-test-shapes: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --jaxtyping-packages=nolbo_ppl.geometry,beartype.beartype tests/geometry -k "not refuses"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -2,12 +2,42 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
+
+SHAPES_CHECKED = [
+    f"nolbo_ppl.{room}"
+    for room in (
+        "geometry",
+        "structures",
+        "io",
+        "metrics",
+        "models.distributions",
+        "inference.association.exact",
+        "inference.association.k_best",
+        "inference.association.marginals",
+        "inference.association.problem",
+    )
+]
+"""Rooms whose annotations are enforced in the tests: what has another shape or type than is written is an error.
+
+Functions that numba compiles check their own arguments, and cannot be wrapped: the rooms that hold them are not listed."""
+jaxtyping.install_import_hook(SHAPES_CHECKED, "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+
+
+@pytest.fixture(autouse=True)
+def _bad_input_reaches_the_library(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A test that expects an error hands in what is wrong, and is about the library's own message: nothing checks before it."""
+    test = inspect.unwrap(request.node.function) if isinstance(request.node, pytest.Function) else None
+    jaxtyping.config.update("jaxtyping_disable", test is not None and "raises" in test.__code__.co_names)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(autouse=True)
@@ -19,14 +49,6 @@ def _float64() -> Iterator[None]:
     torch.set_default_dtype(default)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of a GPU are skipped where there is none."""
-    if not torch.cuda.is_available():
-        for item in items:
-            if item.get_closest_marker("gpu"):
-                item.add_marker(pytest.mark.skip(reason="no CUDA device"))
-
-
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real data, outside the repository for its licences: `$NOLBO_DATA` or `../shared/data`."""
@@ -34,3 +56,9 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"real data not found at {path}: set NOLBO_DATA to its folder")
     return path
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With several workers the slow tests come first: at the end, one worker would run them while the others wait."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: item.get_closest_marker("slow") is None)

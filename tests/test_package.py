@@ -14,6 +14,8 @@ import warnings
 from operator import attrgetter
 from pathlib import Path
 
+import jaxtyping
+import numpy as np
 import pytest
 
 import nolbo_ppl
@@ -141,6 +143,20 @@ def test_names_of_the_first_version_warn_and_work(module: str, old: str, new: st
     assert not hasattr(home, "Nothing") and old not in vars(home)
 
 
+def test_the_short_name_of_object_slam_holds_its_public_names() -> None:
+    """`nolbo_ppl.slam` was the command in 0.1.0: what it had still works, with a warning."""
+    program = "import nolbo_ppl.slam as s; print(s.solve.__module__, sorted(set(dir(s)) & {'SlamConfig', 'solve'}))"
+    done = subprocess.run(
+        [sys.executable, "-W", "error::FutureWarning", "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "nolbo_ppl.inference.slam.solve ['SlamConfig', 'solve']"
+    short = importlib.import_module("nolbo_ppl.slam")
+    with pytest.warns(FutureWarning, match=r"nolbo_ppl.slam.run moved to nolbo_ppl.cli.slam"):
+        assert short.run is importlib.import_module("nolbo_ppl.cli.slam").run
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = short.nothing
+
+
 def test_importing_the_package_is_light() -> None:
     heavy = {"torch", "pyro", "matplotlib", "gtsam", "numpy"}
     program = f"import sys, nolbo_ppl, nolbo_ppl.cli; print(sorted(set(sys.modules) & {heavy}))"
@@ -211,3 +227,20 @@ def test_the_licence_is_apache() -> None:
     text = (ROOT / "LICENSE").read_text(encoding="utf-8")
     assert text.split()[:5] == ["Apache", "License", "Version", "2.0,", "January"]
     assert "END OF TERMS AND CONDITIONS" in text
+
+
+def test_annotations_are_enforced_in_the_tests() -> None:
+    """Shapes, their agreement among arguments, and types: by the hook of `conftest.py`, in every room it names."""
+    from nolbo_ppl.geometry.pose import make_pose
+    from tests.conftest import SHAPES_CHECKED
+
+    assert make_pose(np.eye(3)[None], np.zeros((1, 3))).shape == (1, 4, 4)
+    caught = 0
+    for arguments in ((np.eye(4)[None], np.zeros((1, 3))), (np.eye(3)[None], np.zeros((1, 2))), ([1.0], np.zeros((1, 3)))):
+        try:  # not `pytest.raises`, which marks tests that are left alone
+            make_pose(*arguments)  # type: ignore[arg-type]
+        except jaxtyping.TypeCheckError:
+            caught += 1
+    assert caught == 3
+    for room in SHAPES_CHECKED:
+        assert any(f"{path.relative_to(ROOT).with_suffix('')}".replace("/", ".").startswith(room) for path in modules()), room

@@ -17,9 +17,17 @@ from nolbo_ppl.io.images import image_size, open_image
 from nolbo_ppl.io.npz import read_voxels
 from nolbo_ppl.io.scenes import image_field, parse_record
 from nolbo_ppl.structures.annotations import Annotations
+from nolbo_ppl.structures.label_arrays import (
+    SLOTS,
+    Arrays,
+    allocentric_viewpoints,
+    assemble,
+    empty_labels,
+    fill_annotations,
+    fill_regions,
+)
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.dataset_writer import SCENES
-from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels
 
 PADDING = 114
 """Grey value of the bars beside an image that is not square."""
@@ -129,36 +137,12 @@ class SceneFolder:
 
     def _label_arrays(self) -> Arrays:
         labels = empty_labels(len(self.records), self.slots)
-        regions = max(len(record.ignore) for record in self.records)
-        labels["ignore"] = np.zeros((len(self.records), regions, 4), dtype=np.float32)
-        labels["exhaustive"] = np.ones((len(self.records), len(self.categories)), dtype=np.bool_)
-        for row, record in enumerate(self.records):
-            scale, left, top = self._placing(row)
-            shift = np.array([left, top])
-            labels["intrinsics"][row] = record.intrinsics * scale
-            labels["intrinsics"][row, 2:] += shift
-            at = (row, slice(len(record)))
-            labels["present"][at] = True
-            labels["box"][at] = record.box * scale + np.tile(shift, 2)
-            labels["visibility"][at], labels["symmetry"][at] = record.visibility, record.symmetry
-            labels["category"][at] = record.labels(self.categories)
-            labels["instance"][at] = [self._number.get(name or "", -1) for name in record.instance]
-            for name, mask, values in (
-                ("rotation", "has_viewpoint", record.R_camera_object),
-                ("position", "has_position", record.position),
-                ("diagonal", "has_size", record.diagonal),
-            ):
-                known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-                labels[name][row, : len(record)][known], labels[mask][at] = values[known], known
-            for number, box in enumerate(record.ignore):
-                labels["ignore"][row, number] = box * scale + np.tile(shift, 2)
-            if record.exhaustive is not None:
-                labels["exhaustive"][row] = [name in record.exhaustive for name in self.categories]
+        placings = [self._placing(row) for row in range(len(self.records))]
+        for row, (record, placing) in enumerate(zip(self.records, placings)):
+            numbers = [self._number.get(name or "", -1) for name in record.instance]
+            fill_annotations(labels, row, record, self.categories, numbers, placing)
         labels["viewpoint"] = allocentric_viewpoints(labels)
-        if not any(len(record.ignore) for record in self.records):
-            del labels["ignore"]
-        if all(record.exhaustive is None for record in self.records):
-            del labels["exhaustive"]
+        fill_regions(labels, self.records, self.categories, placings)
         return labels
 
     def __len__(self) -> int:

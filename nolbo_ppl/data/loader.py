@@ -13,8 +13,8 @@ from jaxtyping import Int
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.parallel import parallel
+from nolbo_ppl.structures.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_annotations
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
-from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 T = TypeVar("T")
@@ -67,9 +67,9 @@ def render_batch(source: SceneGenerator, first: int, size: int, slots: int = SLO
     for row in range(size):
         rendered = source.render(first + row)
         images[row] = rendered.image.transpose(2, 0, 1)
-        fill_rendered(labels, row, rendered)
-        for slot, label in enumerate(rendered.labels):
-            voxels[row, slot] = label.item.voxels
+        fill_annotations(labels, row, rendered.annotations, instance=rendered.numbers)
+        for slot, asset in enumerate(rendered.assets):
+            voxels[row, slot] = asset.voxels
     labels["viewpoint"] = allocentric_viewpoints(labels)
     return assemble(images, labels, voxels, labels["present"].copy())
 

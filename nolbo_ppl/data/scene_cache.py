@@ -25,8 +25,8 @@ from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.io.output_folder import locked
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.structures.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_annotations
 from nolbo_ppl.synthetic.assets.shape_library import BLOCK, VOXELS
-from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS, Arrays, allocentric_viewpoints, assemble, empty_labels, fill_rendered
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered
 
 VERSION = 2
@@ -73,9 +73,9 @@ def _write_shard(source: Source, folder: Path, shard: int, slots: int) -> int:
     for row in range(BLOCK):
         rendered = source.render(shard * BLOCK + row)
         images[row] = rendered.image.transpose(2, 0, 1)
-        fill_rendered(labels, row, rendered)
-        for label in rendered.labels:
-            voxels.setdefault(label.item.number, label.item.voxels)
+        fill_annotations(labels, row, rendered.annotations, instance=rendered.numbers)
+        for asset in rendered.assets:
+            voxels.setdefault(asset.number, asset.voxels)
     images.flush()
     del images
     labels["viewpoint"] = allocentric_viewpoints(labels)
@@ -171,7 +171,7 @@ class CachedScenes:
         return self.count
 
     def batch(self, indices: Sequence[int] | Int[np.ndarray, " b"]) -> Arrays:
-        """The scenes of these numbers, in the layout of `nolbo_ppl.inference.batch.SceneBatch`, as NumPy arrays.
+        """The scenes of these numbers, in the layout of `nolbo_ppl.models.scene_batch.SceneBatch`, as NumPy arrays.
 
         Raises:
             InputError: a number outside [0, count).

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nolbo_ppl.errors import NolboError
-from nolbo_ppl.evaluation.labelled_scenes import annotations_of
 from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.assets.shape_library import ShapeLibrary
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, render_scene
@@ -77,5 +76,5 @@ class InstanceViews:
 
     def pair(self, category: str, number: int) -> tuple[Annotations, Annotations]:
         """The two views of an instance."""
-        first, second = (annotations_of(render_view(self.source, category, number, view)) for view in (0, 1))
+        first, second = (render_view(self.source, category, number, view).with_voxels() for view in (0, 1))
         return first, second

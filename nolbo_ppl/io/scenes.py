@@ -1,4 +1,4 @@
-"""One line of `scenes.jsonl`: the labels of one image, read with every check.
+"""One line of `scenes.jsonl`: the labels of one image, written, and read with every check.
 
 A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objects": [...]}`; an object is
 `{"box": [x0, y0, x1, y1] px, "category", "instance", "rotation": [qx, qy, qz, qw] of R_camera_object, "position":
@@ -19,7 +19,7 @@ import torch
 
 from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.rotation import quaternion_to_matrix
+from nolbo_ppl.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix
 from nolbo_ppl.io.fields import is_number
 from nolbo_ppl.io.files import inside, is_file
 from nolbo_ppl.structures.annotations import Annotations
@@ -107,11 +107,11 @@ def _parse_object(
         size = at.number(row, "size", where, "the box diagonal in m, positive")
         if size <= 0:
             raise at.error(f"{where}size", size, "the box diagonal in m, positive")
-    elif "dimensions" in known:
+    dimensions = None
+    if "dimensions" in known:
         dimensions = at.numbers(row, "dimensions", where, 3, "three side lengths in m, positive")
         if (dimensions <= 0).any():
             raise at.error(f"{where}dimensions", dimensions.tolist(), "three side lengths in m, positive")
-        size = float(np.linalg.norm(dimensions))
     visibility = at.number(row, "visibility", where, "a share from 0 to 1") if "visibility" in known else 1.0
     if not 0 <= visibility <= 1:
         raise at.error(f"{where}visibility", visibility, "a share from 0 to 1")
@@ -127,6 +127,7 @@ def _parse_object(
         "R_camera_object": R,
         "position": position,
         "diagonal": size,
+        "dimensions": dimensions,
         "visibility": visibility,
         "symmetry": symmetry,
     }
@@ -171,9 +172,43 @@ def parse_record(
     if exhaustive is not None and not (isinstance(exhaustive, list) and all(name in list(categories) for name in exhaustive)):
         raise at.error("exhaustive", exhaustive, "a list of categories among " + ", ".join(categories))
     ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
-    columns = ("box", "category", "instance", "id", "R_camera_object", "position", "diagonal", "visibility", "symmetry")
+    columns = ("box", "category", "instance", "id", "R_camera_object", "position", "diagonal", "dimensions")
+    columns += ("visibility", "symmetry")
     values: dict[str, Any] = {name: [thing[name] for thing in parsed] for name in columns}
     return Annotations.from_arrays(intrinsics, **values, ignore=ignore, exhaustive=exhaustive, file=image)
+
+
+def annotations_record(scene: Annotations, image: str) -> dict[str, Any]:
+    """The line of an image's annotations: px, m and shares to 1e-6, quaternions to 1e-9; what is missing stays away.
+
+    Args:
+        scene: the labels.
+        image: path of the image, relative to the folder of the file.
+    """
+
+    def rounded(values: np.ndarray) -> list[float]:
+        return [round(float(v), 6) for v in values]
+
+    objects = []
+    for k in range(len(scene)):
+        row: dict[str, Any] = {"category": scene.category[k], "instance": scene.instance[k], "box": rounded(scene.box[k])}
+        if np.isfinite(scene.R_camera_object[k]).all():
+            quaternion = matrix_to_quaternion(torch.from_numpy(scene.R_camera_object[k]))
+            row["rotation"] = [round(v, 9) for v in quaternion.tolist()]
+        if np.isfinite(scene.position[k]).all():
+            row["position"] = rounded(scene.position[k])
+        if np.isfinite(scene.diagonal[k]):
+            row["size"] = round(float(scene.diagonal[k]), 6)
+        if np.isfinite(scene.dimensions[k]).all():
+            row["dimensions"] = rounded(scene.dimensions[k])
+        row |= {"visibility": round(float(scene.visibility[k]), 6), "symmetry": int(scene.symmetry[k]), "id": scene.id[k]}
+        objects.append({name: value for name, value in row.items() if value is not None})
+    line: dict[str, Any] = {"image": image, "intrinsics": rounded(scene.intrinsics), "objects": objects}
+    if len(scene.ignore):
+        line["ignore"] = [rounded(box) for box in scene.ignore]
+    if scene.exhaustive is not None:
+        line["exhaustive"] = list(scene.exhaustive)
+    return line
 
 
 def image_field(row: dict[str, Any], folder: Path, file: Path, line: int) -> Path:

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.camera import pixel_ray, project
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.structures.annotations import Annotations
+from nolbo_ppl.structures.label_arrays import allocentric_viewpoints, assemble, empty_labels, fill_annotations, fill_regions
+
+VOXEL_BYTES = 32**3 // 8
+"""Bytes of a packed grid of 32^3 voxels."""
 
 
 @dataclass
@@ -80,6 +89,51 @@ class SceneBatch:
     decode_order: Float[Tensor, "b m"] | None = None
     """Random numbers: where only some objects are decoded, those of the smallest are; drawn from torch's generator when they
     are not given."""
+
+    @classmethod
+    def from_annotations(
+        cls,
+        scenes: Sequence[Annotations],
+        categories: Sequence[str] = CATEGORIES,
+        *,
+        slots: int | None = None,
+        instances: Mapping[str, int] | None = None,
+    ) -> SceneBatch:
+        """The network's batch of labelled images of one size.
+
+        Args:
+            scenes: the images with their labels.
+            categories: names of the category labels (`model.config.categories`); other names are unlabelled.
+            slots: object slots an image; as many as are needed by default.
+            instances: label of a shape by its name; unlabelled by default.
+
+        Raises:
+            InputError: no image, images of several sizes, voxels in some of them alone, or more objects than slots.
+
+        Example:
+            >>> import numpy as np, nolbo_ppl
+            >>> seen = nolbo_ppl.Annotations.from_arrays(
+            ...     [60, 60, 32, 32], [[10, 10, 40, 50]], category=["car"], pixels=np.zeros((64, 64, 3), np.uint8))
+            >>> nolbo_ppl.SceneBatch.from_annotations([seen], ("bus", "car")).category
+            tensor([[1]])
+        """
+        shapes = {scene.image.shape for scene in scenes}
+        voxel_bytes = {scene.voxels.shape[1] for scene in scenes if scene.voxels is not None and len(scene)}
+        if len(shapes) != 1 or len(voxel_bytes) > 1:
+            do = "bring them to one size (nolbo_ppl.data.dataset_folder.letterbox)"
+            raise input_error("images of one batch", got=(sorted(shapes), sorted(voxel_bytes)), expected="one size", do=do)
+        labels = empty_labels(len(scenes), max([slots or 1, *([] if slots else map(len, scenes))]))
+        voxels = np.zeros((*labels["present"].shape, max(voxel_bytes, default=VOXEL_BYTES)), dtype=np.uint8)
+        for row, scene in enumerate(scenes):
+            numbers = [(instances or {}).get(name or "", -1) for name in scene.instance]
+            fill_annotations(labels, row, scene, categories, numbers)
+            if scene.voxels is not None and len(scene):
+                voxels[row, : len(scene)] = scene.voxels
+        labels["viewpoint"] = allocentric_viewpoints(labels)
+        fill_regions(labels, scenes, categories, [(1.0, 0.0, 0.0)] * len(scenes))
+        images = np.stack([scene.image.transpose(2, 0, 1) for scene in scenes])
+        arrays = assemble(images, labels, voxels, voxels.any(axis=-1))
+        return cls(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()})
 
     def replace(self, **changes: Any) -> SceneBatch:
         """A copy with other fields."""

@@ -22,7 +22,8 @@ MIN_VISIBILITY = 0.5
 class Annotations:
     """The labelled objects of one image, a row each; what is missing is unlabelled, never guessed.
 
-    A line of `scenes.jsonl`, a rendered scene, a frame of a generated sequence: whoever trains or evaluates takes this.
+    A line of `scenes.jsonl`, a rendered scene, a frame of a generated sequence: whoever trains or evaluates takes this
+    (`nolbo_ppl.SceneBatch.from_annotations` makes the network's batch of several).
 
     Example:
         >>> import nolbo_ppl
@@ -50,6 +51,8 @@ class Annotations:
     """Centre of the object's box in the camera frame, m."""
     diagonal: Float[np.ndarray, " m"]
     """Diagonal of that box, m."""
+    dimensions: Float[np.ndarray, "m 3"]
+    """Side lengths of that box along the object's axes, m."""
     visibility: Float[np.ndarray, " m"]
     """Visible share, 1 where nobody says otherwise."""
     symmetry: Int[np.ndarray, " m"]
@@ -110,6 +113,7 @@ class Annotations:
         R_camera_object: Any = None,
         position: Any = None,
         diagonal: Any = None,
+        dimensions: Any = None,
         visibility: Any = None,
         symmetry: Any = None,
         ignore: Any = None,
@@ -126,7 +130,8 @@ class Annotations:
             category: [m] names.
             R_camera_object: [m, 3, 3].
             position: [m, 3] m.
-            diagonal: [m] m.
+            diagonal: [m] m; that of `dimensions` where these are given alone.
+            dimensions: [m, 3] m.
             visibility: [m], 1 by default.
             symmetry: [m], 1 by default.
             ignore: [k, 4] px.
@@ -151,6 +156,8 @@ class Annotations:
                 raise input_error(f"{name} of labelled objects", got=len(found), expected=m)
             return found
 
+        sides = full(dimensions, (3,), "dimensions", np.nan)
+        diagonals = full(diagonal, (), "diagonal", np.nan)
         if voxels is not None and len(voxels) != m:
             raise input_error("voxels of labelled objects", got=len(voxels), expected=m)
         return cls(
@@ -161,7 +168,8 @@ class Annotations:
             id=names(id, "id"),
             R_camera_object=full(R_camera_object, (3, 3), "R_camera_object", np.nan),
             position=full(position, (3,), "position", np.nan),
-            diagonal=full(diagonal, (), "diagonal", np.nan),
+            diagonal=np.where(np.isnan(diagonals), np.linalg.norm(sides, axis=1), diagonals),
+            dimensions=sides,
             visibility=full(visibility, (), "visibility", 1.0),
             symmetry=full(symmetry, (), "symmetry", 1.0).astype(np.int64),
             ignore=np.zeros((0, 4)) if ignore is None else np.asarray(ignore, dtype=np.float64).reshape(-1, 4),
@@ -172,5 +180,5 @@ class Annotations:
         )
 
 
-ARRAYS = ("box", "R_camera_object", "position", "diagonal", "visibility", "symmetry")
+ARRAYS = ("box", "R_camera_object", "position", "diagonal", "dimensions", "visibility", "symmetry")
 """Fields with a row of numbers for each object."""

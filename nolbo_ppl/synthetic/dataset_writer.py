@@ -14,11 +14,11 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import atomic_path, read_json, read_jsonl, write_json, write_jsonl
 from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.io.output_folder import contents, locked, sweep
+from nolbo_ppl.io.scenes import annotations_record
 from nolbo_ppl.parallel import parallel
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
-from nolbo_ppl.synthetic.scenes.scene_records import record_of
 
 CHUNK = 128
 """Scenes that one job renders."""
@@ -35,9 +35,9 @@ def _write_chunk(source: SceneGenerator, out: Path, first: int, last: int) -> in
         name = f"images/{index:06d}.png"
         with atomic_path(out / name) as temporary:
             Image.fromarray(rendered.image).save(temporary)
-        rows.append(record_of(rendered, name))
-        for label in rendered.labels:
-            voxels.setdefault(label.instance, label.item.voxels)
+        rows.append(annotations_record(rendered.annotations, name))
+        for asset in rendered.assets:
+            voxels.setdefault(asset.shape.instance, asset.voxels)
     parts = out / ".parts"
     save_npz(parts / f"{first:06d}.npz", voxels, compressed=False)
     write_jsonl(parts / f"{first:06d}.jsonl", rows)

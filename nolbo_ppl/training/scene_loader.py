@@ -21,7 +21,7 @@ from nolbo_ppl.models.baselines.single_object import one_object_batch
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
-from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
+from nolbo_ppl.structures.label_arrays import Arrays
 from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
 
 JITTER_STREAM = 2**41

@@ -14,11 +14,13 @@ from nolbo_ppl.data import scene_cache as cache
 from nolbo_ppl.data.loader import batch_indices, prefetch, render_batch, shuffled_batches, streamed_batches
 from nolbo_ppl.data.scene_cache import CachedScenes, cache_key, write_cache
 from nolbo_ppl.errors import InputError
+from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.parallel import parallel
-from nolbo_ppl.synthetic.scenes.label_arrays import Arrays
+from nolbo_ppl.structures.annotations import Annotations
+from nolbo_ppl.structures.label_arrays import Arrays
 from nolbo_ppl.synthetic.scenes.scene_config import easy, standard
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
-from nolbo_ppl.training.scene_loader import ConcatScenes
+from nolbo_ppl.training.scene_loader import ConcatScenes, to_batch
 
 FIELDS = {
     "image",
@@ -225,3 +227,34 @@ def test_prefetch_hands_over_exceptions_and_stops() -> None:
         assert next(ahead) == 0
     assert closed.is_set()
     assert all(thread.name != "prefetch" for thread in threading.enumerate())
+
+
+def test_labelled_images_make_the_batch_that_the_loader_makes(source: SceneGenerator) -> None:
+    """The library's own scenes as annotations, one by one, are the network's batch of the loader."""
+    expected = to_batch(render_batch(source, 3, 4, slots=8))
+    rendered = [source.render(k) for k in range(3, 7)]
+    numbers = {asset.shape.instance: asset.number for one in rendered for asset in one.assets}
+    scenes = [one.with_voxels() for one in rendered]
+    batch = SceneBatch.from_annotations(scenes, slots=8, instances=numbers)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(batch, name), getattr(expected, name), err_msg=name)
+    fewest = SceneBatch.from_annotations(scenes)
+    assert fewest.present.shape[1] == max(map(len, scenes)) and (fewest.instance == -1).all()
+
+
+def test_what_is_not_labelled_reaches_the_batch() -> None:
+    image = np.zeros((16, 16, 3), np.uint8)
+    one = Annotations.from_arrays([9, 9, 8, 8], [[1, 2, 5, 6]], category=["tram"], ignore=[[0, 0, 3, 3]], pixels=image)
+    two = Annotations.from_arrays([9, 9, 8, 8], [], exhaustive=["car"], pixels=image)
+    batch = SceneBatch.from_annotations([one, two], ("bus", "car"))
+    assert batch.ignore is not None and batch.exhaustive is not None
+    assert batch.ignore[:, 0].tolist() == [[0, 0, 3, 3], [0, 0, 0, 0]]
+    assert batch.exhaustive.tolist() == [[True, True], [False, True]]
+    assert batch.category.tolist() == [[-1], [-1]] and batch.present.tolist() == [[True], [False]]
+    assert not (batch.has_viewpoint | batch.has_position | batch.has_size | batch.has_voxels).any()
+    with pytest.raises(InputError, match="images of one batch"):
+        SceneBatch.from_annotations([one, Annotations.from_arrays([9, 9, 8, 8], [], pixels=image[:8])])
+    with pytest.raises(InputError, match="images of one batch"):
+        SceneBatch.from_annotations([])
+    with pytest.raises(InputError, match="more objects than slots"):
+        SceneBatch.from_annotations([Annotations.from_arrays([9, 9, 8, 8], np.ones((2, 4)), pixels=image)], slots=1)

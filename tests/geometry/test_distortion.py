@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,14 @@ def test_boxes_hold_what_was_in_them() -> None:
     np.testing.assert_allclose([*inside.min(0), *inside.max(0)], found, atol=2.0)
 
 
+@cache
+def pixels_through(model: str) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of an image of 640 x 480 px, and where the pinhole camera sees what is there."""
+    v, u = np.mgrid[:480, :640]
+    pixels = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)
+    return pixels, undistort_points(pixels, CAMERA, model, LENSES[model])
+
+
 @pytest.mark.parametrize("model", list(LENSES))
 def test_images_are_what_a_pinhole_camera_sees(model: str) -> None:
     """A pattern painted through the lens, undistorted, is the pattern."""
@@ -65,9 +75,7 @@ def test_images_are_what_a_pinhole_camera_sees(model: str) -> None:
     def pattern(points: np.ndarray) -> np.ndarray:
         return 128 + 100 * np.sin(points[:, 0] / 40) * np.cos(points[:, 1] / 31)
 
-    v, u = np.mgrid[:480, :640]
-    pixels = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)
-    ideal = undistort_points(pixels[::1], CAMERA, model, LENSES[model])
+    pixels, ideal = pixels_through(model)
     image = np.repeat(pattern(ideal).reshape(480, 640, 1), 3, axis=2).astype(np.uint8)
     found = undistort_image(image, CAMERA, model, LENSES[model])[..., 0]
     expected = pattern(pixels).reshape(480, 640)
@@ -82,9 +90,8 @@ def test_depth_is_moved_and_never_mixed(model: str) -> None:
     def walls(points: np.ndarray) -> np.ndarray:
         return np.where(points[:, 0] + 0.3 * points[:, 1] < 380, 2.0, 5.0)
 
-    v, u = np.mgrid[:480, :640]
-    pixels = np.stack([u.ravel(), v.ravel()], 1).astype(np.float64)
-    seen = walls(undistort_points(pixels, CAMERA, model, LENSES[model])).reshape(480, 640)
+    pixels, ideal = pixels_through(model)
+    seen = walls(ideal).reshape(480, 640)
     for depth, step in ((seen, 1), (seen[::2, ::2], 2)):
         found = undistort_depth(depth, CAMERA, model, LENSES[model], size=(640, 480))
         expected = walls(pixels).reshape(480, 640)[::step, ::step]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.io.scenes import parse_record
+from nolbo_ppl.io.scenes import annotations_record, parse_record
 from nolbo_ppl.structures.annotations import ARRAYS, Annotations
 
 CAMERA = [100.0, 100.0, 50.0, 40.0]
@@ -37,6 +37,19 @@ def test_a_line_of_labels() -> None:
     assert seen.file == Path("x.png")
     with pytest.raises(InputError, match="labels without their image"):
         _ = seen.image
+
+
+def test_what_was_read_is_written_as_the_same_line() -> None:
+    """Every field, and objects of which little is known."""
+    row = {**line(position=[0.1, 0, 4], size=2.5, dimensions=[2.0, 1.2, 0.9], visibility=0.25, symmetry=2), "exhaustive": ["car"]}
+    seen = parsed(row)
+    again = annotations_record(seen, "x.png")
+    bare = {"box": [0, 0, 5, 5], "visibility": 1.0, "symmetry": 1}
+    assert again == {**row, "objects": [row["objects"][0], bare]}  # type: ignore[index]
+    twice = parsed(again)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(twice, name), getattr(seen, name), err_msg=name)
+    assert parsed(line(dimensions=[2.0, 1.0, 2.0])).diagonal[0] == 3.0  # the box's diagonal, where only its sides are stated
 
 
 @pytest.mark.parametrize("exhaustive", ["car", ["tram"], [["car"]], [3]])

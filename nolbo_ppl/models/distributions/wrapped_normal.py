@@ -32,7 +32,7 @@ class TrigonometricMoments(NamedTuple):
     """Cov[sin, cos]."""
 
 
-def wrapped_normal_moments(loc: Float[Tensor, "*batch"], scale: Float[Tensor, "*batch"]) -> TrigonometricMoments:
+def wrapped_normal_moments(loc: Float[Tensor, "*#batch"], scale: Float[Tensor, "*#batch"]) -> TrigonometricMoments:
     """Moments of (sin, cos) of a wrapped normal angle, accurate near the axes in float32.
 
     NOLBO eq. (meanvarofwrappedgaussian), whose variances (there called sigma) lose 26 % in float32 at a scale of

@@ -8,12 +8,14 @@ different objects of a scene are not those of one real place.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.assets.shape_library import ShapeAsset
 from nolbo_ppl.synthetic.renderer.camera_view import MeshInstance, View
 from nolbo_ppl.synthetic.renderer.ray_casting import Hits, average_down, image_window, shade, to_display, trace
@@ -72,13 +74,81 @@ class ObjectLabel:
 
 @dataclass(frozen=True)
 class Rendered:
-    """An image with its labels."""
+    """An image with its labels, and what only the renderer knows."""
 
-    image: UInt8[np.ndarray, "h w 3"]
-    intrinsics: Float[np.ndarray, " 4"]
-    labels: tuple[ObjectLabel, ...]
+    annotations: Annotations
+    """The image and its labels."""
+    assets: tuple[ShapeAsset, ...]
+    """Shape of each object."""
     instance_id: Int[np.ndarray, "h w"]
     """Number of the label each pixel shows, or -1 (at the first ray of the pixel)."""
+
+    @classmethod
+    def from_labels(
+        cls,
+        image: UInt8[np.ndarray, "h w 3"],
+        intrinsics: Float[np.ndarray, " 4"],
+        labels: Sequence[ObjectLabel],
+        instance_id: Int[np.ndarray, "h w"],
+        ids: Sequence[str] | None = None,
+    ) -> Rendered:
+        """Of an image and its objects one by one; `ids` are their names in a sequence."""
+        annotations = Annotations.from_arrays(
+            intrinsics,
+            np.array([label.box for label in labels]).reshape(-1, 4),
+            category=[label.category for label in labels],
+            instance=[label.instance for label in labels],
+            id=ids,
+            R_camera_object=[label.R_camera_object for label in labels],
+            position=[label.position for label in labels],
+            diagonal=[label.size for label in labels],
+            dimensions=[label.dimensions for label in labels],
+            visibility=[label.visibility for label in labels],
+            symmetry=[label.symmetry for label in labels],
+            pixels=image,
+        )
+        return cls(annotations, tuple(label.item for label in labels), instance_id)
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The image."""
+        return self.annotations.image
+
+    @property
+    def intrinsics(self) -> Float[np.ndarray, " 4"]:
+        """[fx, fy, cx, cy], px."""
+        return self.annotations.intrinsics
+
+    @property
+    def numbers(self) -> list[int]:
+        """Number of each object's shape in its library."""
+        return [asset.number for asset in self.assets]
+
+    @property
+    def labels(self) -> tuple[ObjectLabel, ...]:
+        """The annotations row by row, for those who look at one object."""
+        seen = self.annotations
+        return tuple(
+            ObjectLabel(
+                category=asset.shape.category,
+                instance=asset.shape.instance,
+                box=seen.box[k],
+                R_camera_object=seen.R_camera_object[k],
+                position=seen.position[k],
+                size=float(seen.diagonal[k]),
+                dimensions=seen.dimensions[k],
+                visibility=float(seen.visibility[k]),
+                symmetry=int(seen.symmetry[k]),
+                item=asset,
+            )
+            for k, asset in enumerate(self.assets)
+        )
+
+    def with_voxels(self) -> Annotations:
+        """The annotations with the shapes' packed voxels."""
+        n = len(self.assets)
+        voxels = np.array([asset.voxels for asset in self.assets], dtype=np.uint8).reshape(n, -1 if n else 0)
+        return replace(self.annotations, voxels=voxels)
 
 
 def amodal_box(placed: MeshInstance, view: View) -> Float[np.ndarray, " 4"]:
@@ -156,7 +226,7 @@ def render_scene(scene: Scene) -> Rendered:
         number[k] = len(labels)
         labels.append(_label(scene.objects[placed.instance_id], amodal_box(placed, scene.view), visibility[placed.instance_id]))
     instance_id = number[hits.index[::factor, ::factor]]
-    return Rendered(image, scene.view.intrinsics, tuple(labels), instance_id)
+    return Rendered.from_labels(image, scene.view.intrinsics, labels, instance_id)
 
 
 def _label(thing: SceneObject, box: np.ndarray, visibility: float) -> ObjectLabel:

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import inverse
+from nolbo_ppl.io.scenes import annotations_record
 from nolbo_ppl.synthetic.renderer.antialias import shade_smoothly
 from nolbo_ppl.synthetic.renderer.camera_view import Light, MeshInstance, View
 from nolbo_ppl.synthetic.renderer.ray_casting import to_display, trace
 from nolbo_ppl.synthetic.scenes.render_scene import ObjectLabel, Rendered, amodal_box
-from nolbo_ppl.synthetic.scenes.scene_records import record_of
 from nolbo_ppl.synthetic.worlds.placing import WorldObject
 from nolbo_ppl.synthetic.worlds.world import World
 
@@ -28,15 +28,15 @@ class RenderedFrame:
     """An image with its labels, and which objects they name."""
 
     rendered: Rendered
-    ids: tuple[str, ...]
-    """Object of each label."""
+
+    @property
+    def ids(self) -> tuple[str | None, ...]:
+        """Object of each label."""
+        return self.rendered.annotations.id
 
     def record(self, image: str) -> dict[str, Any]:
         """The line of `scenes.jsonl`."""
-        row = record_of(self.rendered, image)
-        for thing, name in zip(row["objects"], self.ids):
-            thing["id"] = name
-        return row
+        return annotations_record(self.rendered.annotations, image)
 
 
 def _reach(point: np.ndarray, radius: float, intrinsics: np.ndarray, size: tuple[int, int]) -> bool:
@@ -113,7 +113,7 @@ def render_frame(world: World, frame: int) -> RenderedFrame:
         labels.append(_label(shown[placed.instance_id], placed, box, visibility))
         ids.append(shown[placed.instance_id].id)
     instance_id = number[hits.index]
-    return RenderedFrame(Rendered(image, world.intrinsics, tuple(labels), instance_id), tuple(ids))
+    return RenderedFrame(Rendered.from_labels(image, world.intrinsics, labels, instance_id, ids))
 
 
 def _label(thing: WorldObject, placed: MeshInstance, box: Float[np.ndarray, " 4"], visibility: float) -> ObjectLabel:

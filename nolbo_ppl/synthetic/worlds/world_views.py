@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.synthetic.scenes.label_arrays import SLOTS
-from nolbo_ppl.synthetic.scenes.render_scene import ObjectLabel, Rendered
+from nolbo_ppl.structures.label_arrays import SLOTS
+from nolbo_ppl.synthetic.scenes.render_scene import Rendered
 from nolbo_ppl.synthetic.worlds.camera_path import camera_pose
 from nolbo_ppl.synthetic.worlds.sequence_folder import LAYOUT
 from nolbo_ppl.synthetic.worlds.world import World, make_world
@@ -102,12 +102,14 @@ class ViewSource:
         rng = np.random.default_rng([self.seed, 7300, index])
         rendered = self._look(world, rng)
         for _ in range(MAX_ATTEMPTS):
-            if 1 <= len(rendered.labels) <= SLOTS:
+            if 1 <= len(rendered.annotations) <= SLOTS:
                 break
             rendered = self._look(world, rng)
-        labels = sorted(rendered.labels, key=lambda one: -float(np.prod(one.box[2:] - one.box[:2])))[:SLOTS]
+        box = rendered.annotations.box
+        largest = np.argsort(-np.prod(box[:, 2:] - box[:, :2], axis=1), kind="stable")[:SLOTS]
         first = NUMBERS * (WORLDS_A_SEED * self.seed + number + 1)
-        return replace(rendered, labels=tuple(_renumbered(label, first) for label in labels))
+        assets = tuple(replace(rendered.assets[k], number=first + rendered.assets[k].number) for k in largest)
+        return replace(rendered, annotations=rendered.annotations.select(largest), assets=assets)
 
     def _look(self, world: World, rng: np.random.Generator) -> Rendered:
         """One image from a random place."""
@@ -137,7 +139,3 @@ class ViewSource:
     def describe(self) -> dict[str, object]:
         """All that the scenes depend on, as plain JSON values."""
         return {"views": asdict(self.config), "seed": self.seed, "views_version": VERSION, "layout": LAYOUT}
-
-
-def _renumbered(label: ObjectLabel, first: int) -> ObjectLabel:
-    return replace(label, item=replace(label.item, number=first + label.item.number))

@@ -12,11 +12,11 @@ from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
 from nolbo_ppl.geometry.rotation import geodesic_angle, ray_rotation, viewpoint_to_matrix
+from nolbo_ppl.structures.label_arrays import allocentric_viewpoints, empty_labels, fill_annotations
 from nolbo_ppl.synthetic.assets.shape_library import SEED_STRIDE, ShapeLibrary
 from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance
 from nolbo_ppl.synthetic.renderer.ray_casting import trace
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
-from nolbo_ppl.synthetic.scenes.label_arrays import allocentric_viewpoints, empty_labels, fill_rendered
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, Scene, amodal_box, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import DIFFICULTIES, SceneConfig, full, preset, standard
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
@@ -72,7 +72,7 @@ def test_every_pixel_lies_on_the_labelled_shape(rendered: list[tuple[Scene, Rend
         hits = trace(replace(scene.view, placed=kept))
         for number, label in enumerate(image.labels):
             rows, columns = np.nonzero(image.instance_id == number)
-            thing = next(t for t in scene.objects if t.R_camera_object is label.R_camera_object)
+            thing = next(t for t in scene.objects if np.array_equal(t.R_camera_object, label.R_camera_object))
             depth = hits.depth[rows, columns] * (label.size / thing.diagonal)
             fx, fy, cx, cy = image.intrinsics
             rays = np.stack(((columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))), axis=1)
@@ -91,8 +91,10 @@ def test_every_pixel_lies_on_the_labelled_shape(rendered: list[tuple[Scene, Rend
 
 def _kept(scene: Scene, image: Rendered) -> tuple[MeshInstance, ...]:
     """Clutter and the objects that kept their labels."""
-    wanted = [id(label.R_camera_object) for label in image.labels]
-    instance_ids = {k for k, thing in enumerate(scene.objects) if id(thing.R_camera_object) in wanted}
+    wanted = {R.tobytes() for R in image.annotations.R_camera_object}
+    instance_ids = {
+        k for k, thing in enumerate(scene.objects) if np.asarray(thing.R_camera_object, dtype=np.float64).tobytes() in wanted
+    }
     return tuple(p for p in scene.view.placed if p.instance_id < 0 or p.instance_id in instance_ids)
 
 
@@ -188,7 +190,7 @@ def test_allocentric_viewpoint_far_off_the_axis(rendered: list[tuple[Scene, Rend
     # The same on rendered scenes: rotation = ray rotation times the rotation of the viewpoint.
     labels = empty_labels(COUNT)
     for row, (_, image) in enumerate(rendered):
-        fill_rendered(labels, row, image)
+        fill_annotations(labels, row, image.annotations, instance=image.numbers)
     allocentric = allocentric_viewpoints(labels)
     for row, slot in zip(*np.nonzero(labels["present"])):
         position = torch.from_numpy(labels["position"][row, slot].astype(np.float64))
@@ -314,4 +316,4 @@ def test_bad_configurations() -> None:
         ShapeLibrary(CATEGORIES, seed=-1)
     with pytest.raises(InputError, match="more objects than slots"):
         rendered = SceneGenerator(replace(standard(64), objects=(5, 6), empty_probability=0.0), seed=3, instances=1)
-        fill_rendered(empty_labels(1, 1), 0, max((rendered.render(k) for k in range(4)), key=lambda r: len(r.labels)))
+        fill_annotations(empty_labels(1, 1), 0, max((rendered.render(k).annotations for k in range(4)), key=len))
