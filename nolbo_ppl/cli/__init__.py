@@ -22,6 +22,7 @@ VERBS = {
     "train": "train an observation model",
     "curves": "draw the curves of a training run",
     "evaluate": "measure a model on unseen scenes",
+    "reproduce": "the paper's tables and figures",
     "observe": "posteriors of the objects in a folder of images",
     "convert": "bring real data into the formats of slam and evaluate",
     "simulate": "write a simulated world for slam: odometry, detections, truth",

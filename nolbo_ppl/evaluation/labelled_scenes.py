@@ -41,10 +41,13 @@ class FolderScenes:
 
     folder: SceneFolder
     count: int
+    first: int = 0
+    """Number of the scene that comes first."""
 
     def __len__(self) -> int:
-        return min(self.count, len(self.folder))
+        return min(self.count, len(self.folder) - self.first)
 
     def __getitem__(self, index: int) -> Annotations:
-        labels = self.folder.records[index]
-        return replace(labels, voxels=self.folder.voxels(index), pixels=self.folder.image(index))
+        row = self.first + index
+        labels = self.folder.records[row]
+        return replace(labels, voxels=self.folder.voxels(row), pixels=self.folder.image(row))

@@ -113,7 +113,7 @@ def make_world(config: SequenceConfig) -> World:
         tuple(objects),
         static,
         materials,
-        *_light(config, light_rng),
+        *world_light(config, light_rng),
     )
 
 
@@ -131,7 +131,7 @@ def _moving(config: SequenceConfig, loop: Loop, catalogue: Catalogue, first: int
     return made
 
 
-def _light(
+def world_light(
     config: SequenceConfig, rng: np.random.Generator
 ) -> tuple[tuple[Light, ...], np.ndarray, np.ndarray, Environment, float]:
     """Sun and sky, or the lamps of a room: fixed in the ground frame."""

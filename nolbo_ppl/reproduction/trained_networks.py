@@ -1,0 +1,89 @@
+"""The compared networks, trained alike: one encoder that stays as it is, the same scenes, the same number of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from nolbo_ppl.data.dataset_folder import SceneFolder
+from nolbo_ppl.evaluation.labelled_scenes import FolderScenes
+from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.inference.posterior.single_object_predictor import SingleObjectModel
+from nolbo_ppl.models.baselines.method import METHODS
+from nolbo_ppl.reproduction.budgets import NETWORKS, ReproduceConfig
+from nolbo_ppl.synthetic.dataset_writer import write_scenes
+from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+from nolbo_ppl.training.train_config import TrainConfig
+from nolbo_ppl.training.trainer import run
+
+TRAIN_SEED, HELD_OUT_SEED = 301, 9301
+"""Seeds of the generated scenes: neither scenes nor shapes of one are among those of the other."""
+INITIAL = "tiny"
+"""Shipped weights whose features all start from."""
+
+
+def scene_folders(config: ReproduceConfig) -> tuple[Path, Path | None]:
+    """Scenes to learn from and held-out ones; of a folder of data, itself and its last tenth (None)."""
+    if config.folder is not None:
+        return config.folder, None
+    sizes = config.sizes
+    folders = []
+    for name, seed, count in (("train", TRAIN_SEED, sizes.scenes), ("held_out", HELD_OUT_SEED, sizes.held_out)):
+        folder = config.out / "scenes" / config.budget / name
+        source = SceneGenerator(preset("standard" if config.budget != "smoke" else "easy", sizes.image_size), seed)
+        write_scenes(folder, source, count, config.workers)
+        folders.append(folder)
+    return folders[0], folders[1]
+
+
+def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
+    """How a network is trained."""
+    network, sizes = NETWORKS[name], config.sizes
+    train, held_out = scene_folders(config)
+    return TrainConfig(
+        out=config.out / "networks" / config.budget / f"{name}-{seed}",
+        preset="tiny",
+        method=network.method,
+        latent_dim=network.latent_dim,
+        initial=INITIAL,
+        initial_part="features",
+        freeze_encoder=True,
+        scenes=(train,),
+        validation=held_out,
+        image_size=sizes.image_size,
+        seed=seed,
+        shape_steps=sizes.shape_steps,
+        single_steps=0,
+        scene_steps=sizes.scene_steps,
+        batch=sizes.batch,
+        shape_batch=min(32, sizes.batch),
+        evaluate_every=10**6,
+        evaluate_scenes=64,
+        checkpoint_every=20,
+        threads=config.threads,
+        workers=config.workers,
+    )
+
+
+def trained(config: ReproduceConfig, name: str, seed: int) -> ObservationModel:
+    """A network, trained if it is not yet; NOLBO on single objects is shown the boxes of the scene network of the same seed."""
+    training = training_of(config, name, seed)
+    if not (training.out / "model" / "config.json").is_file():
+        run(training)
+    model = load(training.out / "model")
+    if METHODS[NETWORKS[name].method].one_object:
+        return SingleObjectModel(model.model, model.calibration, trained(config, "multi16", seed))
+    return model
+
+
+def held_out_scenes(config: ReproduceConfig, categories: Sequence[str], symmetry: Sequence[int]) -> FolderScenes:
+    """The scenes to measure on: the held-out folder, or the last tenth of a folder of data."""
+    train, held_out = scene_folders(config)
+    size = config.sizes.image_size
+    if held_out is not None:
+        return FolderScenes(SceneFolder(held_out, categories, size=size, symmetry=symmetry), config.sizes.held_out)
+    folder = SceneFolder(train, categories, size=size, symmetry=symmetry)
+    first = len(folder) - max(1, len(folder) // 10)
+    return FolderScenes(folder, config.sizes.held_out, first)
