@@ -50,7 +50,7 @@ def test_augmented_shapes() -> None:
 
 
 def test_two_kinds_of_shapes_are_told_apart(tmp_path: Path) -> None:
-    config = ShapeVaeConfig(steps=24, batch=12, decode=4, shift=0, half_precision=False)
+    config = ShapeVaeConfig(steps=16, batch=8, decode=2, shift=0, half_precision=False)
     archive = posts_and_slabs(24)
     losses: list[float] = []
     model = fit_shape_vae(archive, config, tmp_path / "a.safetensors", lambda info: losses.append(info.loss))
@@ -97,7 +97,7 @@ def test_decoded_shapes_stand_for_all() -> None:
     batch = ShapeBatch(*(part[0, :1].repeat(6, *(1,) * (part.dim() - 2)) for part in
                          (scene.voxels, scene.category, scene.instance, scene.noise)))  # fmt: skip
     terms = [
-        SceneELBO().terms(model.shape_story, model.shape_guide, batch, names={"voxels", "shape_kl"}, decode=decode)
+        SceneELBO().terms(model.shape_model, model.shape_guide, batch, names={"voxels", "shape_kl"}, decode=decode)
         for decode in (None, 2)
     ]
     torch.testing.assert_close(terms[0]["voxels"], terms[1]["voxels"])
