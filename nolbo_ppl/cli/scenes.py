@@ -27,7 +27,8 @@ class ScenesConfig:
     seed: int = 0
     """Which scenes and which shapes; another seed shows unseen scenes of unseen shapes."""
     cad: Path | None = None
-    """Folder of CAD meshes (OFF, OBJ, PLY, GLB in a sub-folder per category) in place of the generated shapes."""
+    """Folder of CAD meshes (OFF, OBJ, PLY, GLB in a sub-folder per category) in place of the generated shapes, painted with the
+    colours of their materials and textures; or a furniture library of Sweet Home 3D (`.sh3f`)."""
     up: str | None = None
     """The axis of the CAD files that points up, x, y or z with its sign; by default +y of GLB and glTF, +z of the others."""
     front: str | None = None

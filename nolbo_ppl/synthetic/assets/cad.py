@@ -12,14 +12,16 @@ from jaxtyping import Float
 
 from nolbo_ppl.errors import NolboError, input_error
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
-from nolbo_ppl.io.files import read_json_object
+from nolbo_ppl.io.files import inside, is_file, read_json_object
 from nolbo_ppl.io.images import is_passed_over
 from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
-from nolbo_ppl.synthetic.assets.obj_file import read_obj
+from nolbo_ppl.synthetic.assets.face_colours import PLAIN, Colours, obj_colours, trimesh_colours
+from nolbo_ppl.synthetic.assets.obj_file import read_obj_mesh
 from nolbo_ppl.synthetic.assets.off_file import read_off
+from nolbo_ppl.synthetic.assets.sh3f_file import MAXIMUM_BYTES, load_sh3f
 from nolbo_ppl.synthetic.shapes.canonical_shape import Shape
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb", ".gltf")
@@ -41,7 +43,11 @@ def load_cad_folder(
     max_faces: int | None = 20_000,
     diagonals: Mapping[str, float] | None = None,
 ) -> list[Shape]:
-    """Load every CAD model of a folder as a `Shape` with one part, "body", sorted by file name.
+    """Load every CAD model of a folder as a `Shape`, sorted by file name; a part for each colour of its faces, else one, "body".
+
+    Colours are those of materials and textures of OBJ (with its MTL), GLB and PLY files, read at the middle of each face. In
+    place of a folder a library of Sweet Home 3D is taken too (`.sh3f`, `nolbo_ppl.synthetic.assets.sh3f_file`), whose models
+    have real sizes.
 
     Three layouts are understood:
 
@@ -70,6 +76,8 @@ def load_cad_folder(
         InputError: no such folder, no model in it, or a model that is unreadable, empty or degenerate (names it).
     """
     folder = Path(path)
+    if folder.suffix.lower() == ".sh3f":
+        return load_sh3f(folder, categories, max_faces)
     if not folder.is_dir():
         raise input_error("no such folder of CAD models", file=folder)
     turns = {suffix: axis_rotation(*axes_of(suffix, up, front)) for suffix in SUFFIXES}
@@ -82,9 +90,9 @@ def load_cad_folder(
         files = [entry for entry in _list_files(folder) if wanted is None or entry[0] in wanted]
         shapes = []
         for category, instance, file in progress_bar(files, "CAD", "mesh"):
-            vertices, faces = _read_mesh(file)
+            vertices, faces, colours = _read_coloured(file)
             vertices = vertices @ turns[file.suffix.lower()].T
-            shapes.append(mesh_to_shape(category, instance, vertices, faces, max_faces, diagonals, file=file))
+            shapes.append(mesh_to_shape(category, instance, vertices, faces, max_faces, diagonals, colours=colours, file=file))
     if not shapes:
         which = "any category" if wanted is None else ", ".join(sorted(wanted))
         raise input_error(
@@ -178,22 +186,44 @@ def _split_name(stem: str, file: Path) -> tuple[str, str]:
 
 def _read_mesh(file: Path) -> tuple[Vertices, Faces]:
     """Read one mesh; the parts of a scene are joined in their places. Raises `InputError` naming the file."""
+    return _read_coloured(file)[:2]
+
+
+def _read_coloured(file: Path) -> tuple[Vertices, Faces, Colours | None]:
+    """Read one mesh and the display colour of each face, where the file tells it."""
     if file.suffix.lower() == ".obj":
-        return read_obj(file)
+        mesh = read_obj_mesh(file)
+        return mesh.vertices, mesh.faces, obj_colours(mesh, lambda name: _beside(file, name))
     if file.suffix.lower() == ".off":
-        return read_off(file)
+        return *read_off(file), None
     import trimesh  # delayed: heavy to import
 
     try:
         loaded: Any = trimesh.load_scene(file, process=False)
-        mesh: Any = loaded.to_mesh() if len(loaded.geometry) else None
-        vertices = np.zeros((0, 3)) if mesh is None else np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.zeros((0, 3), np.int64) if mesh is None else np.asarray(mesh.faces, dtype=np.int64)
+        parts: list[Any] = list(loaded.dump()) if len(loaded.geometry) else []
+        parts = [part for part in parts if hasattr(part, "faces")]
+        first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        vertices = np.concatenate([np.zeros((0, 3)), *(np.asarray(part.vertices, dtype=np.float64) for part in parts)])
+        faces = np.concatenate(
+            [np.zeros((0, 3), np.int64), *(np.asarray(p.faces, dtype=np.int64) + k for p, k in zip(parts, first))]
+        )
+        own = [trimesh_colours(part) for part in parts]
     except NolboError:
         raise
     except Exception as error:  # the readers of eight formats raise whatever they meet
         raise input_error("unreadable CAD file", got=f"{type(error).__name__}: {error}", file=file) from error
-    return vertices, faces
+    if all(one is None for one in own):
+        return vertices, faces, None
+    plain = [np.tile(PLAIN, (len(part.faces), 1)) if one is None else one for part, one in zip(parts, own)]
+    return vertices, faces, np.concatenate(plain)
+
+
+def _beside(file: Path, name: str) -> bytes | None:
+    """Content of a file that a model names, within the model's folder."""
+    path = inside(file.parent, name.replace("\\", "/"))
+    if path is None or not is_file(path) or path.stat().st_size > MAXIMUM_BYTES:
+        return None
+    return path.read_bytes()
 
 
 def _load_archive(folder: Path, wanted: set[str] | None, diagonals: Mapping[str, float] | None) -> Iterator[Shape]:

@@ -13,6 +13,7 @@ from nolbo_ppl.categories import CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.voxels import mesh_to_voxels, reduce_voxels, unpack_voxels, voxel_centres, voxel_iou
 from nolbo_ppl.synthetic.assets.cad_sizes import typical_diagonal
+from nolbo_ppl.synthetic.assets.face_colours import painted_parts
 from nolbo_ppl.synthetic.shapes.canonical_shape import Shape, Solid
 
 SYMMETRY_GRID = 32
@@ -73,9 +74,13 @@ def mesh_to_shape(
     diagonals: Mapping[str, float] | None = None,
     *,
     solid: Solid | None = None,
+    colours: Float[np.ndarray, "f 3"] | None = None,
+    licence: str = "",
     file: str | os.PathLike[str] | None = None,
 ) -> Shape:
     """Make a `Shape` of a mesh that stands in the canonical orientation; it is centred and scaled here.
+
+    Faces with colours (display values, 0 to 1) make parts of one colour each; else there is one part, "body".
 
     Raises:
         InputError: no faces, faces pointing past the vertices, vertices that are not finite, or no area.
@@ -94,18 +99,22 @@ def mesh_to_shape(
     area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=-1)
     if not area.sum() > 1e-9:
         raise input_error("degenerate CAD mesh: its faces have no area", got=f"{len(faces)} faces", file=file)
-    points, faces = _simplify(points, faces[area > 0], max_faces)
+    points, faces, kept = _simplify(points, faces[area > 0], max_faces)
+    part, parts = np.zeros(len(faces), dtype=np.int64), ("body",)
+    if colours is not None:
+        part, parts = painted_parts(colours[area > 0][kept])
     fill: Solid = MeshSolid(points, faces) if solid is None else solid
     return Shape(
         category=category,
         instance=instance,
         vertices=points,
         faces=faces,
-        part=np.zeros(len(faces), dtype=np.int64),
-        parts=("body",),
+        part=part,
+        parts=parts,
         diagonal=typical_diagonal(category, diagonals),
         symmetry=_symmetry(category, fill),
         solid=fill,
+        licence=licence,
     )
 
 
@@ -137,15 +146,15 @@ def _turned(grid: np.ndarray, degrees: float) -> np.ndarray:
     return np.asarray(grid[i, j] & inside[:, :, None])
 
 
-def _simplify(vertices: Vertices, faces: Faces, max_faces: int | None) -> tuple[Vertices, Faces]:
+def _simplify(vertices: Vertices, faces: Faces, max_faces: int | None) -> tuple[Vertices, Faces, Int[np.ndarray, " kept"]]:
     """Drop unused vertices; merge those in one cell of a grid, ever coarser, until at most `max_faces` are left.
 
     Clustering moves a vertex to the mean of its cell; it takes any mesh, open or not. The result is put back into the
-    unit box.
+    unit box. The third result is the face that each of the remaining ones was.
     """
     index, inverse = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[index], inverse.reshape(-1, 3)
-    cells, points, triangles = 512.0, vertices, faces
+    cells, points, triangles, kept = 512.0, vertices, faces, np.arange(len(faces))
     while max_faces is not None and len(triangles) > max_faces and cells > 4:
         _, label = np.unique(np.floor((vertices + 0.5) * cells).astype(np.int64), axis=0, return_inverse=True)
         label = label.reshape(-1)
@@ -153,12 +162,13 @@ def _simplify(vertices: Vertices, faces: Faces, max_faces: int | None) -> tuple[
         points = np.stack([np.bincount(label, vertices[:, i]) / count for i in range(3)], axis=-1)
         triangles = label[faces]
         a, b, c = triangles.T
-        triangles = triangles[(a != b) & (b != c) & (c != a)]
-        triangles = triangles[np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1]]
+        kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+        kept = kept[np.unique(np.sort(triangles[kept], axis=1), axis=0, return_index=True)[1]]
+        triangles = triangles[kept]
         cells *= 0.8
     if points is not vertices:
         index, inverse = np.unique(triangles, return_inverse=True)
         points, triangles = points[index], inverse.reshape(-1, 3)
         low, high = points.min(axis=0), points.max(axis=0)
         points = (points - 0.5 * (low + high)) / np.linalg.norm(high - low)
-    return points, triangles.astype(np.int64)
+    return points, triangles.astype(np.int64), kept

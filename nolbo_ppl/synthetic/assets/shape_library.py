@@ -119,7 +119,9 @@ class ShapeLibrary:
         if self.cad is None:
             windows = {"block": BLOCK, "window": WINDOW}
             return {"seed": self.seed, "instances": self.instances, "categories": list(self.categories), **windows}
-        return {"cad": {name: [shape.instance for shape in shapes] for name, shapes in self.cad.items()}}
+        described: dict[str, object] = {"cad": {name: [shape.instance for shape in shapes] for name, shapes in self.cad.items()}}
+        licences = {shape.instance: shape.licence for shapes in self.cad.values() for shape in shapes if shape.licence}
+        return {**described, "licences": licences} if licences else described
 
 
 def packed_voxels(shape: Shape, n: int = VOXELS) -> UInt8[np.ndarray, " bytes"]:

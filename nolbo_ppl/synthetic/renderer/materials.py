@@ -177,8 +177,11 @@ def _screen(rng: np.random.Generator) -> Material:
 
 
 def sample_material(role: str, rng: np.random.Generator) -> Material:
-    """Draw the material of one part role; an unknown role is drawn like "body"."""
+    """Draw the material of one part role; an unknown role is drawn like "body", `colour #rrggbb` has that display colour."""
     r = rng
+    if role.startswith("colour #"):  # a face of a CAD file: its own colour, its gloss unknown
+        red, green, blue = ((int(role[k : k + 2], 16) / 255) ** 2.2 for k in (8, 10, 12))
+        return _glossy(r, (red, green, blue))
     match role:
         case "trim":
             return _glossy(r, _grey(r, 0.05, 0.3))

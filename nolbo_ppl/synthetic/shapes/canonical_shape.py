@@ -111,6 +111,7 @@ class Shape:
         diagonal: the box diagonal in metres.
         symmetry: order about the vertical axis: 1 none, n for n-fold, 0 for free.
         solid: what fills the voxels.
+        licence: who made it and under which licence, where a file says so.
     """
 
     category: str
@@ -122,6 +123,7 @@ class Shape:
     diagonal: float
     symmetry: int
     solid: Solid
+    licence: str = ""
 
     def voxels(self, n: int) -> Bool[np.ndarray, "{n} {n} {n}"]:
         """Solid occupancy at the centres of n^3 voxels over [-0.5, 0.5]^3, index [ix, iy, iz].
