@@ -46,7 +46,7 @@ categories, dimensions = model.config.categories, model.config.latent_dim
 # %% [markdown]
 # ## What the guide sees
 #
-# Some 220 images of one unseen object each. The guide answers for the object's box; its latent's mean is one point.
+# Some 150 images of one unseen object each. The guide answers for the object's box; its latent's mean is one point.
 
 # %%
 single = dataclasses.replace(
@@ -57,7 +57,7 @@ single = dataclasses.replace(
     truncation_probability=0.0,
 )
 source = SceneGenerator(single, seed=88_003)
-scenes = [scene for scene in map(source.render, range(220)) if len(scene.labels) == 1]
+scenes = [scene for scene in map(source.render, range(150)) if len(scene.labels) == 1]
 labels = np.array([categories.index(scene.labels[0].category) for scene in scenes])
 answers = model.observe_boxes(
     [scene.image for scene in scenes],
@@ -81,7 +81,7 @@ for axis, scene in zip(axes, scenes):
 
 # %%
 pool = ShapeLibrary(categories, seed=88_004)
-items = [pool.item(category, number) for category in categories for number in range(24)]
+items = [pool.item(category, number) for category in categories for number in range(16)]
 
 
 def coarse(items):

@@ -47,7 +47,7 @@ folder = Path(tempfile.mkdtemp(prefix="nolbo-"))
 
 
 # %%
-def streets(corners, spacing=2.0, radius=9.0):
+def streets(corners, spacing=3.0, radius=9.0):
     """Camera poses along a closed polygon of streets with rounded corners, `corners` passed in turn."""
     points = []
     for before, here, after in zip(corners, corners[1:], corners[2:]):
@@ -70,7 +70,7 @@ if "NOLBO_DATA" in os.environ and kitti.is_file():
     truth = read_trajectory(kitti).T_world_camera[::3]
 else:
     corners = np.array([(0, 0), (0, 120), (70, 120), (70, 60), (150, 60), (150, 0)], dtype=float)
-    truth = streets(np.concatenate((corners, corners, corners[:3])))[: int(1.5 * 540 / 2)]
+    truth = streets(np.concatenate((corners, corners, corners[:3])))[: int(1.5 * 540 / 3)]
 
 rng = np.random.default_rng(9)
 drive = simulate_sequence(

@@ -8,7 +8,8 @@ import numpy as np
 
 from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
 from nolbo_ppl.inference.slam.noise.fitted_residuals import squared_ratio
-from nolbo_ppl.inference.slam.noise.noise_estimation import SURE_GAIN, TOO_SMALL, step_sigmas
+from nolbo_ppl.inference.slam.noise.neighbour_gaps import SURE_GAIN
+from nolbo_ppl.inference.slam.noise.noise_estimation import TOO_SMALL, step_sigmas
 from nolbo_ppl.inference.slam.noise.scale_evidence import ScaleEvidence, scale_evidence, scale_posterior
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 from nolbo_ppl.inference.slam.slam_state import SlamState

@@ -9,7 +9,8 @@ import pytest
 
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem
-from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise, fit_range_model, robust_scale, same_or_stranger
+from nolbo_ppl.inference.slam.noise.neighbour_gaps import same_or_stranger
+from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise, fit_range_model, robust_scale
 from nolbo_ppl.structures.detections import Detections
 
 
