@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from nolbo_ppl.cli.convert_archives import Coco, ObjectNet3d, Pascal3d, StanfordCars, Voc
+from nolbo_ppl.cli.convert_archives import Coco, ObjectNet3d, Pascal3d, Pix3d, StanfordCars, Voc
 from nolbo_ppl.data.converters import (
     Converted,
     convert_kitti_object,
@@ -231,6 +231,7 @@ Source = (
     | Annotated[ObjectNet3d, tyro.conf.subcommand("objectnet3d")]
     | Annotated[Voc, tyro.conf.subcommand("voc")]
     | Annotated[Coco, tyro.conf.subcommand("coco")]
+    | Annotated[Pix3d, tyro.conf.subcommand("pix3d")]
     | Annotated[StanfordCars, tyro.conf.subcommand("stanford-cars")]
 )
 

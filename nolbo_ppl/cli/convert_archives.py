@@ -5,19 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+import tyro
 
+from nolbo_ppl.categories import PAPER_CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage, write_archive
 from nolbo_ppl.data.converters.coco import read_coco
 from nolbo_ppl.data.converters.pascal3d import cad_files, read_objectnet3d, read_pascal3d
+from nolbo_ppl.data.converters.pix3d import pix3d_models, read_pix3d
 from nolbo_ppl.data.converters.stanford_cars import read_stanford_cars
 from nolbo_ppl.data.converters.voc import read_voc
-from nolbo_ppl.synthetic.assets.cad import load_cad_folder
+from nolbo_ppl.synthetic.assets.voxel_cache import cached_voxels_of
+from nolbo_ppl.training.train_config import DEFAULT_CACHE
 
 GRID = 32
-"""Voxels along an edge of a shape, as data sets hold them."""
+"""Voxels along an edge of a shape, as data sets hold them; networks of 64^3 take either."""
 
 
 def written(counts: dict[str, int]) -> str:
@@ -25,21 +29,26 @@ def written(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
-def shapes_of(root: Path, images: Iterable[ArchiveImage]) -> dict[str, np.ndarray]:
-    """Voxels of every CAD model that the annotations name, by `CLASS/NN`.
+def shapes_of(root: Path, images: Iterable[ArchiveImage], side: int, cache: Path, workers: int) -> dict[str, np.ndarray]:
+    """Packed voxels of every CAD model that the annotations name, by `CLASS/NN`, from the cache where they are known.
 
     Raises:
         InputError: a model is missing, or cannot be read.
     """
     files = cad_files(root, {thing.instance for image in images for thing in image.objects if thing.instance is not None})
-    shapes: dict[str, np.ndarray] = {}
-    for folder in sorted({file.parent.parent for file in files.values()}):
-        classes = {name.split("/")[0] for name in files}
-        for shape in load_cad_folder(folder, classes, diagonals=dict.fromkeys(classes, 1.0)):
-            name = f"{shape.category}/{shape.instance.removeprefix(shape.category + '-')}"
-            if name in files:
-                shapes[name] = shape.voxels(GRID)
-    return shapes
+    return cached_voxels_of(files, side, cache, workers)
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """How shapes are filled."""
+
+    grid: Literal[32, 64] = GRID
+    """Voxels along an edge of each shape."""
+    cache: Path = DEFAULT_CACHE
+    """Where voxels of CAD files are kept between runs."""
+    workers: int = 1
+    """Processes that fill CAD files."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +63,15 @@ class Pascal3d:
     """Official split; they are never mixed."""
     benchmark: bool = False
     """Truncated and occluded objects are regions to ignore, as the viewpoint benchmark has it."""
+    shapes: Annotated[Shapes, tyro.conf.arg(name="")] = Shapes()
+    """How its CAD models are filled."""
 
     def write(self) -> str:
         """Run it and say what was written."""
         images = list(read_pascal3d(self.data, None if self.split == "all" else self.split))
         source = {"archive": "PASCAL3D+ 1.1", "split": self.split, "benchmark": self.benchmark}
-        return written(write_archive(self.out, images, source, shapes_of(self.data, images), self.benchmark))
+        filled = shapes_of(self.data, images, self.shapes.grid, self.shapes.cache, self.shapes.workers)
+        return written(write_archive(self.out, images, source, filled, self.benchmark))
 
 
 @dataclass(frozen=True)
@@ -74,12 +86,43 @@ class ObjectNet3d:
     """Official split; they are never mixed."""
     benchmark: bool = False
     """Truncated and occluded objects are regions to ignore."""
+    shapes: Annotated[Shapes, tyro.conf.arg(name="")] = Shapes()
+    """How its CAD models are filled."""
 
     def write(self) -> str:
         """Run it and say what was written."""
         images = list(read_objectnet3d(self.data, None if self.split == "all" else self.split))
         source = {"archive": "ObjectNet3D", "split": self.split, "benchmark": self.benchmark}
-        return written(write_archive(self.out, images, source, shapes_of(self.data, images), self.benchmark))
+        filled = shapes_of(self.data, images, self.shapes.grid, self.shapes.cache, self.shapes.workers)
+        return written(write_archive(self.out, images, source, filled, self.benchmark))
+
+
+@dataclass(frozen=True)
+class Pix3d:
+    """Pix3D: one object an image with its true camera, viewpoint and CAD model, as scenes; other objects are unknown."""
+
+    data: Path
+    """Folder with pix3d.json, img/, mask/ and model/."""
+    out: Path
+    """Folder for images/, scenes.jsonl, voxels.npz, source.json."""
+    split: Path | None = None
+    """A list of images, one a line, or a COCO-style JSON file with `images[].file_name`: the archive itself has no split."""
+    categories: tuple[str, ...] = PAPER_CATEGORIES
+    """Names to keep."""
+    benchmark: bool = False
+    """Truncated and occluded objects are regions to ignore."""
+    shapes: Annotated[Shapes, tyro.conf.arg(name="")] = Shapes()
+    """How its CAD models are filled."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        images = list(read_pix3d(self.data, self.split, self.categories))
+        names = {thing.instance for image in images for thing in image.objects if thing.instance is not None}
+        filled = cached_voxels_of(
+            pix3d_models(self.data, names), self.shapes.grid, self.shapes.cache, self.shapes.workers, axes=("+y", "-z")
+        )
+        source = {"archive": "Pix3D", "split": None if self.split is None else self.split.name, "benchmark": self.benchmark}
+        return written(write_archive(self.out, images, source, filled, self.benchmark))
 
 
 @dataclass(frozen=True)

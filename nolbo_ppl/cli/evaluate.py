@@ -124,7 +124,13 @@ def open_scenes(config: EvaluateConfig, model_config: ModelConfig) -> Scenes:
     if config.scenes is not None:
         if config.cad is not None or config.backgrounds is not None:
             raise input_error("a folder of scenes and what to generate others from", do="drop --cad, --backgrounds")
-        folder = SceneFolder(config.scenes, categories, size=model_config.image_size, symmetry=model_config.symmetry)
+        folder = SceneFolder(
+            config.scenes,
+            categories,
+            size=model_config.image_size,
+            symmetry=model_config.symmetry,
+            voxel_side=model_config.voxel_size,
+        )
         return FolderScenes(folder, config.count)
     return GeneratedScenes(open_source(config, model_config), config.count)
 

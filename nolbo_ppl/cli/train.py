@@ -4,6 +4,8 @@ Stages (NOLBO, training details; docs/training.md): the shape autoencoder (decod
 guide on images of one object; the guide on scenes, decoder and prior frozen. Every batch is a function of the seed and
 the step, checkpoints hold all that a step changes, and a killed run goes on exactly where its last checkpoint stands.
 Started by `torchrun`, several processes or machines share each batch.
+
+The paper's own programme on its data sets: `nolbo train --stage imagenet|viewpoint|vae|single|multi --help`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,15 @@ def main(args: Sequence[str] | None = None) -> None:
     """Parse the command line and train."""
     import tyro
 
-    config = tyro.cli(TrainConfig, args=args, prog="nolbo train", description=__doc__)
+    given = list(sys.argv[1:] if args is None else args)
+    if any(word == "--stage" or word.startswith("--stage=") for word in given):
+        from nolbo_ppl.training.paper_config import PaperConfig
+        from nolbo_ppl.training.paper_stages import run_paper
+
+        stage = tyro.cli(PaperConfig, args=given, prog="nolbo train", description=PaperConfig.__doc__)
+        sys.stdout.write(json.dumps(dataclasses.asdict(run_paper(stage)), indent=2, default=str) + "\n")
+        return
+    config = tyro.cli(TrainConfig, args=given, prog="nolbo train", description=__doc__)
     summary = run(config)
     sys.stdout.write(json.dumps(dataclasses.asdict(summary), indent=2, default=str) + "\n")
     if config.photographs is not None:

@@ -12,9 +12,10 @@ from PIL import Image
 
 from nolbo_ppl.categories import CATEGORIES, CATEGORY_SYMMETRY
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.voxels import resized_bits
 from nolbo_ppl.io.files import read_jsonl
 from nolbo_ppl.io.images import image_size, open_image
-from nolbo_ppl.io.npz import read_voxels
+from nolbo_ppl.io.npz import read_voxels, voxel_side
 from nolbo_ppl.io.scenes import image_field, parse_record
 from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.structures.label_arrays import (
@@ -74,6 +75,7 @@ class SceneFolder:
         size: int = 128,
         slots: int | None = None,
         symmetry: Sequence[int] | None = None,
+        voxel_side: int = VOXELS,
     ) -> None:
         """Open a folder.
 
@@ -85,6 +87,7 @@ class SceneFolder:
             slots: object slots an image; by default 8, or more when an image has more objects.
             symmetry: order of each of `categories` for objects that state none; by default `CATEGORY_SYMMETRY`, 1 for names
                 unknown there.
+            voxel_side: side of the grids of a batch; those of the file are brought to it.
 
         Raises:
             InputError: anything malformed, naming file, line and field.
@@ -96,7 +99,7 @@ class SceneFolder:
             raise input_error("image size", got=size, expected="a positive multiple of 32")
         if not self.path.is_dir():
             raise input_error("no such data set", got=path, expected=f"a folder with {SCENES}")
-        self.categories, self.size = tuple(categories), size
+        self.categories, self.size, self.voxel_side = tuple(categories), size, voxel_side
         if symmetry is not None and len(symmetry) != len(self.categories):
             raise input_error("symmetry", got=len(symmetry), expected=f"one of each of {len(self.categories)} categories")
         self._symmetries = CATEGORY_SYMMETRY if symmetry is None else dict(zip(self.categories, symmetry))
@@ -125,7 +128,10 @@ class SceneFolder:
 
     def _read_voxels(self) -> dict[str, UInt8[np.ndarray, " bytes"]]:
         file = self.path / "voxels.npz"
-        return read_voxels(file) if file.is_file() else {}
+        if not file.is_file():
+            return {}
+        stored = voxel_side(file)
+        return {name: resized_bits(bits, stored, self.voxel_side) for name, bits in read_voxels(file, stored).items()}
 
     def _placing(self, row: int) -> tuple[float, float, float]:
         """Scale and shift (px) that `letterbox` gives the image of a row."""
@@ -157,7 +163,7 @@ class SceneFolder:
     def voxels(self, index: int) -> UInt8[np.ndarray, "m bytes"]:
         """Packed grids of the objects of a row, all zero where one is unknown."""
         grids = [self._voxels.get(name or "") for name in self.records[index].instance]
-        empty = np.zeros(VOXELS**3 // 8, dtype=np.uint8)
+        empty = np.zeros(self.voxel_side**3 // 8, dtype=np.uint8)
         return np.array([empty if bits is None else bits for bits in grids], dtype=np.uint8).reshape(len(grids), len(empty))
 
     def intrinsics(self, index: int) -> Float[np.ndarray, " 4"]:
@@ -175,7 +181,7 @@ class SceneFolder:
             raise input_error("no such image in the data set", got=index.tolist(), expected=f"0 to {len(self) - 1}")
         images = np.stack([letterbox(self.image(int(i)), self.size)[0].transpose(2, 0, 1) for i in index])
         labels = {name: array[index] for name, array in self.labels.items()}
-        voxels = np.zeros((len(index), self.slots, VOXELS**3 // 8), dtype=np.uint8)
+        voxels = np.zeros((len(index), self.slots, self.voxel_side**3 // 8), dtype=np.uint8)
         has_voxels = np.zeros((len(index), self.slots), dtype=np.bool_)
         for row, i in enumerate(index):
             for slot, name in enumerate(self.records[i].instance):
@@ -194,6 +200,6 @@ class SceneFolder:
                 if bits is not None and number >= 0 and label >= 0:
                     found[number] = (bits, label)
         order = sorted(found)
-        packed = np.array([found[n][0] for n in order], dtype=np.uint8).reshape(len(found), VOXELS**3 // 8)
+        packed = np.array([found[n][0] for n in order], dtype=np.uint8).reshape(len(found), self.voxel_side**3 // 8)
         category = np.array([found[n][1] for n in order], dtype=np.int64)
         return np.array(order, dtype=np.int64), packed, category

@@ -37,6 +37,10 @@ class LabelledPictures:
     def __len__(self) -> int:
         return len(self.files)
 
+    def part(self, index: Int[np.ndarray, " m"]) -> LabelledPictures:
+        """Some of the pictures."""
+        return LabelledPictures([self.files[int(i)] for i in index], self.label[index], self.classes)
+
     def picture(self, index: int, size: int, seed: int | None = None) -> UInt8[np.ndarray, "3 {size} {size}"]:
         """A picture at a size: a random part in random colours by a seed, the middle without one.
 

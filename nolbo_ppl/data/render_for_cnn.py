@@ -54,6 +54,11 @@ class RenderedViewpoints:
     def __len__(self) -> int:
         return len(self.files)
 
+    def part(self, index: Int[np.ndarray, " m"]) -> RenderedViewpoints:
+        """Some of the pictures."""
+        files = [self.files[int(i)] for i in index]
+        return RenderedViewpoints(files, self.category[index], self.viewpoint[index], self.categories)
+
     def picture(self, index: int, size: int, seed: int | None = None) -> UInt8[np.ndarray, "3 {size} {size}"]:
         """A picture at a size, in random colours by a seed; never turned over, which would change its viewpoint.
 

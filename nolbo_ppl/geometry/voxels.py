@@ -46,6 +46,26 @@ def unpack_voxels(packed: UInt8[np.ndarray, "*batch bytes"], n: int) -> Bool[np.
     return np.unpackbits(packed, axis=-1, count=n**3).astype(bool).reshape(*packed.shape[:-1], n, n, n)
 
 
+def resized_bits(packed: UInt8[np.ndarray, "*batch bytes"], n: int, wanted: int) -> UInt8[np.ndarray, "*batch bytes2"]:
+    """Packed grids of n^3 voxels as grids of `wanted`^3: each voxel repeated, or blocks filled where any of them is.
+
+    Raises:
+        InputError: one size is no multiple of the other, or the bytes are not those of n^3 bits.
+    """
+    if n == wanted:
+        return packed
+    grid = unpack_voxels(packed, n)
+    if wanted % n == 0:
+        for axis in (-3, -2, -1):
+            grid = np.repeat(grid, wanted // n, axis=axis)
+    elif n % wanted == 0:
+        k = n // wanted
+        grid = grid.reshape(*grid.shape[:-3], wanted, k, wanted, k, wanted, k).any(axis=(-5, -3, -1))
+    else:
+        raise input_error("size of a voxel grid", got=f"{n} for {wanted}", expected="one a multiple of the other")
+    return pack_voxels(grid)
+
+
 def voxel_iou(a: Bool[np.ndarray, "*#batch _ _ _"], b: Bool[np.ndarray, "*#batch _ _ _"]) -> Float[np.ndarray, "*batch"]:
     """Intersection over union of paired grids (broadcast); two empty grids agree: 1.
 

@@ -35,6 +35,8 @@ class OptimizerConfig:
     """Rate the warm-up starts from: it grows linearly to `learning_rate`, which its last step reaches."""
     warmup: int = 100
     """Steps of warm-up."""
+    hold: int = 0
+    """Steps at `start_rate` before the warm-up."""
     decay: float = 0.5
     """Share of the steps, at the end, over which the rate falls to 2 % along a cosine."""
     weight_decay: float = 0.01
@@ -79,9 +81,11 @@ class StepInfo:
 
 
 def learning_rate(config: OptimizerConfig, step: int) -> float:
-    """Rate of a step (from 0): linear warm-up, plateau, cosine to 2 % at the end."""
-    if step < config.warmup:
-        return config.start_rate + (config.learning_rate - config.start_rate) * (step + 1) / config.warmup
+    """Rate of a step (from 0): held at the start, linear warm-up, plateau, cosine to 2 % at the end."""
+    if step < config.hold:
+        return config.start_rate
+    if step < config.hold + config.warmup:
+        return config.start_rate + (config.learning_rate - config.start_rate) * (step - config.hold + 1) / config.warmup
     start = config.steps * (1 - config.decay)
     if config.decay <= 0 or step < start:
         return config.learning_rate

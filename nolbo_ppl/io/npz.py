@@ -174,6 +174,23 @@ def read_voxels(path: str | os.PathLike[str], side: int = 32) -> dict[str, UInt8
         return {name: archive.array(name) for name in archive.names}
 
 
+def voxel_side(path: str | os.PathLike[str], usual: int = 32) -> int:
+    """Side of the grids that a file of packed voxels holds, by its first one; the usual one where it holds none.
+
+    Raises:
+        InputError: as `Npz`, or bytes of no cube.
+    """
+    with Npz(path) as archive:
+        header = next(iter(archive.headers.values()), None)
+        if header is None:
+            return usual
+        side = round((8 * header.shape[0]) ** (1 / 3)) if len(header.shape) == 1 else 0
+        if side**3 != 8 * (header.shape[0] if header.shape else 0) or side == 0:
+            got = f"{header.dtype} {list(header.shape)}"
+            raise input_error(f"voxels of {archive.names[0]}", got=got, expected="uint8 [n^3 / 8]", file=archive.path)
+        return side
+
+
 def read_npy(path: str | os.PathLike[str], shape: Shape, largest: int = LARGEST_ARRAY) -> np.ndarray:
     """The array of numbers of an NPY file; NaN and infinity stay. Raises `InputError` naming the file."""
     path = existing_file(path)

@@ -89,34 +89,44 @@ _DARKNET19: tuple[tuple[tuple[int, int], ...], ...] = (
 
 
 class Darknet19Encoder(nn.Module):
-    """The paper's encoder: darknet19's 18 convolutions, then three 3 x 3 convolutions of 1024 channels; stride 32."""
+    """The paper's encoder: darknet19's 18 convolutions, then three 3 x 3 convolutions of 1024 channels; stride 32.
+
+    Args:
+        width: factor on all channels.
+    """
 
     stride = 32
-    channels = 1024
     fine_channels: tuple[int, ...] = ()
     fine_strides: tuple[int, ...] = ()
 
-    def __init__(self) -> None:
+    def __init__(self, width: float = 1.0) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         inputs = 3
         for index, stage in enumerate(_DARKNET19):
             if index:
                 layers.append(nn.MaxPool2d(2))
-            for outputs, kernel in stage:
+            for full, kernel in stage:
+                outputs = narrowed(full, width)
                 layers.append(ConvUnit(inputs, outputs, kernel))
                 inputs = outputs
+        self.channels = inputs
         self.core = nn.Sequential(*layers)
-        self.neck = nn.Sequential(*(ConvUnit(1024, 1024, 3) for _ in range(3)))
+        self.neck = nn.Sequential(*(ConvUnit(inputs, inputs, 3) for _ in range(3)))
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b 1024 gh gw"], tuple[Tensor, ...]]:
         """Features of each 32 x 32 px cell; the first pooling follows the first convolution, the last the fifth stage."""
         return self.neck(self.core(image)), ()
 
 
+def narrowed(channels: int, width: float) -> int:
+    """Channels of a layer by a factor, at least four."""
+    return max(4, round(channels * width))
+
+
 def make_encoder(config: ModelConfig) -> TinyEncoder | Darknet19Encoder:
     """The encoder a configuration names."""
-    return TinyEncoder(config) if config.encoder == "tiny" else Darknet19Encoder()
+    return TinyEncoder(config) if config.encoder == "tiny" else Darknet19Encoder(config.encoder_width)
 
 
 def check_image(image: Tensor) -> None:

@@ -38,6 +38,8 @@ class ModelConfig:
     """Channels of the tiny encoder at strides 2, 4, 8 and 16."""
     encoder_blocks: tuple[int, int, int] = (1, 2, 2)
     """Residual blocks of the tiny encoder at strides 4, 8 and 16."""
+    encoder_width: float = 1.0
+    """Factor on the channels of darknet19."""
     head_width: int = 320
     """Width of the head's hidden layers (tiny encoder only; darknet19 has a linear head as the paper)."""
     glimpse: int = 7
@@ -161,7 +163,7 @@ class ModelConfig:
                     expected="one channel count per doubling of a 4^3 grid",
                 )
         scales = ("max_concentration", "orientation_scale", "rotation_concentration", "box_scale", "range_scale")
-        positive = (*scales, "head_width", "predictors", "latent_dim", "prior_width")
+        positive = (*scales, "encoder_width", "head_width", "predictors", "latent_dim", "prior_width")
         lists = ("encoder_channels", "decoder_channels", "voxel_encoder_channels", "box_spread", "range_spread")
         for name, numbers in [(n, (getattr(self, n),)) for n in positive] + [(n, getattr(self, n)) for n in lists]:
             if not all(number > 0 for number in numbers):

@@ -17,11 +17,13 @@ from nolbo_ppl.data.loader import Scenes, batch_indices
 from nolbo_ppl.data.mirror import mirror, mirror_voxels
 from nolbo_ppl.data.scene_cache import CachedScenes
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.voxels import resized_bits
 from nolbo_ppl.models.baselines.single_object import one_object_batch
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.structures.label_arrays import Arrays
+from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
 
 JITTER_STREAM = 2**41
@@ -50,10 +52,11 @@ class SceneSubset:
 
 
 class ConcatScenes:
-    """Several data sets of one pool of shapes, one after the other; smaller images are enlarged to the size of the largest."""
+    """Several data sets of one pool of shapes, one after the other; smaller images are enlarged to the size of the largest,
+    voxels (kept at 32^3) brought to the side that the networks decode."""
 
-    def __init__(self, parts: Sequence[CachedScenes]) -> None:
-        self.parts = parts
+    def __init__(self, parts: Sequence[CachedScenes], voxel_side: int = VOXELS) -> None:
+        self.parts, self.voxel_side = parts, voxel_side
         self._first = np.cumsum([0, *(len(part) for part in parts)])
         self.size = max(part.size for part in parts)
 
@@ -73,13 +76,15 @@ class ConcatScenes:
                 if name not in result:
                     result[name] = np.empty((len(index), *value.shape[1:]), value.dtype)
                 result[name][rows] = value
+        if "voxels" in result:
+            result["voxels"] = resized_bits(result["voxels"], VOXELS, self.voxel_side)
         return result
 
     def shapes(self) -> tuple[Int[np.ndarray, " n"], UInt8[np.ndarray, "n bytes"], Int[np.ndarray, " n"]]:
         """Number, voxels and category of every shape, each once."""
         number, packed, category = (np.concatenate(values) for values in zip(*(part.shapes() for part in self.parts)))
         number, first = np.unique(number, return_index=True)
-        return number, packed[first], category[first]
+        return number, resized_bits(packed[first], VOXELS, self.voxel_side), category[first]
 
 
 def enlarged(arrays: Arrays, size: int) -> Arrays:

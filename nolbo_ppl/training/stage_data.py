@@ -55,7 +55,7 @@ class TrainingData:
         if len(config.scenes) + config.generated > 1:
             self._open_mix()
         elif config.scenes:
-            self._open_folders(config.scenes[0], self.model.image_size)
+            self._open_folders(config.scenes[0])
         else:
             self._generate()
         if len(self.table) == 0 and config.shape_steps:
@@ -82,7 +82,8 @@ class TrainingData:
     def _cached(self, sources: Sequence[SceneGenerator | ViewSource], count: int) -> ConcatScenes:
         """Scenes of some sources, as many of each; the first process renders what is missing."""
         root = self.config.cache.expanduser() / "scenes"
-        return ConcatScenes([write_cache(root, one, -(-count // len(sources)), self.config.workers) for one in sources])
+        parts = [write_cache(root, one, -(-count // len(sources)), self.config.workers) for one in sources]
+        return ConcatScenes(parts, self.model.voxel_size)
 
     def _generate(self) -> None:
         """Generated scenes, and held-out ones of another seed."""
@@ -107,10 +108,7 @@ class TrainingData:
     def _open_mix(self) -> None:
         """Folders and generated scenes in fixed shares; every tenth scene of each is held out."""
         config = self.config
-        parts: list[SceneFolder | ConcatScenes] = [
-            SceneFolder(path, self.model.categories, size=self.model.image_size, symmetry=self.model.symmetry)
-            for path in config.scenes
-        ]
+        parts: list[SceneFolder | ConcatScenes] = [self._folder(path) for path in config.scenes]
         if config.generated:
             if self.world > 1 and self.rank > 0:
                 distributed.barrier()
@@ -126,16 +124,23 @@ class TrainingData:
         self.train = self.single = self._mix[-1][0]
         self._held_out = self._held_out_mix[-1][0]
 
-    def _open_folders(self, path: Path, size: int) -> None:
+    def _folder(self, path: Path, instances: Sequence[str] | None = None) -> SceneFolder:
+        """A data set on disk, its images and voxels at the networks' sizes."""
+        model = self.model
+        return SceneFolder(
+            path, model.categories, instances, model.image_size, symmetry=model.symmetry, voxel_side=model.voxel_size
+        )
+
+    def _open_folders(self, path: Path) -> None:
         """A user's folder, and a held-out one or its last tenth."""
-        folder = SceneFolder(path, self.model.categories, size=size, symmetry=self.model.symmetry)
+        folder = self._folder(path)
         known = 0
         if self.config.instance_labels:
             number, _, category = folder.shapes()
             names = tuple(folder.instances[n] for n in number)
             self.model = dataclasses.replace(self.model, instances=names, instance_category=tuple(int(c) for c in category))
             others = tuple(name for name in folder.instances if name not in set(names))
-            folder = SceneFolder(path, self.model.categories, names + others, size=size, symmetry=self.model.symmetry)
+            folder = self._folder(path, names + others)
             known = len(names)
         self.train = folder
         self.table = ShapeTable(*folder.shapes(), known)
@@ -145,7 +150,7 @@ class TrainingData:
             self.train, self._held_out = SceneSubset(folder, np.arange(cut)), SceneSubset(folder, np.arange(cut, len(folder)))
             self.single, self._held_out_table = self.train, self.table
         else:
-            held_out_folder = SceneFolder(self.config.validation, self.model.categories, size=size, symmetry=self.model.symmetry)
+            held_out_folder = self._folder(self.config.validation)
             self._held_out, self._held_out_table = held_out_folder, ShapeTable(*held_out_folder.shapes())
 
     @property

@@ -36,6 +36,7 @@ from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
 from nolbo_ppl.training.detector_file import adopt, adopt_features
 from nolbo_ppl.training.domain_fit import contexts_of, fit_domain, learn_sizes
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
+from nolbo_ppl.training.model_card import write_card
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.photograph_fit import PARTS, PhotographFit, adopt_fit, find_objects, fit_found
 from nolbo_ppl.training.stage_data import TrainingData
@@ -71,7 +72,7 @@ def run(config: TrainConfig) -> TrainSummary:
             something else, or another process writes into it.
     """
     device = device_of(config.device)
-    rank, world = _join(device)
+    rank, world = join_processes(device)
     with run_folder(config.out) if rank == 0 else nullcontext():
         return _run(config, rank, world, device)
 
@@ -136,6 +137,8 @@ def _run(config: TrainConfig, rank: int, world: int, device: torch.device) -> Tr
             "versions": {"nolbo_ppl": __version__, "torch": torch.__version__},
         }
         save(config.out / "model", model, calibration, meta)
+        defaults = {name: value for name, value in TrainConfig().to_json().items() if name != "out"}
+        write_card(config.out / "model", model.config, meta, sum(p.numel() for p in model.parameters()), defaults)
         training_logger.close()
     if world > 1:
         distributed.barrier()
@@ -228,7 +231,7 @@ def compile_networks(model: Nolbo) -> None:
         part.compile()
 
 
-def _join(device: torch.device) -> tuple[int, int]:
+def join_processes(device: torch.device) -> tuple[int, int]:
     """Rank and number of processes; joins the group when `torchrun` started several: NCCL on CUDA devices, else Gloo."""
     if device.type == "cuda":
         torch.cuda.set_device(device)

@@ -6,24 +6,21 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import svi as optimisation
-from nolbo_ppl.inference.svi import StepInfo
+from nolbo_ppl.inference.svi import OptimizerState, StepInfo
 from nolbo_ppl.io.fields import is_whole
 from nolbo_ppl.io.files import atomic_path, read_json_object, read_jsonl, write_json
 from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.io.tensors import check_tensors, load_tensors, save_tensors
-from nolbo_ppl.models.observation_model import Nolbo
-from nolbo_ppl.training.stages import StageRun, TrainingStage
-from nolbo_ppl.training.train_config import TrainConfig
 
-FILES = frozenset({"metrics.jsonl", "checkpoint.safetensors", "config.json", "model", "tensorboard"})
+FILES = frozenset({"metrics.jsonl", "checkpoint.safetensors", "config.json", "model", "core.safetensors", "tensorboard"})
 """What a run writes into its folder."""
 
 
@@ -32,7 +29,8 @@ def is_run(folder: Path) -> bool:
     file = folder / "config.json"
     if not file.is_file():
         return (folder / "checkpoint.safetensors").is_file()
-    return {"out", "scene_steps"} <= set(read_json_object(file))
+    stated = set(read_json_object(file))
+    return {"out", "scene_steps"} <= stated or {"out", "stage", "data"} <= stated
 
 
 @contextmanager
@@ -56,14 +54,53 @@ def run_folder(folder: Path) -> Iterator[None]:
         yield
 
 
+class RunOptions(Protocol):
+    """What is asked of the configuration of a run."""
+
+    @property
+    def out(self) -> Path:
+        """Its folder."""
+
+    @property
+    def resume(self) -> bool:
+        """Go on from its checkpoint."""
+
+    @property
+    def tensorboard(self) -> bool:
+        """Write TensorBoard files."""
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must agree with."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON keeps it."""
+
+
+class Named(Protocol):
+    """A stage, or a phase of one, with the name that rows of metrics.jsonl have."""
+
+    @property
+    def name(self) -> str:
+        """The name."""
+
+
+class UnderWay(Protocol):
+    """A stage under way."""
+
+    state: OptimizerState
+    """Everything a step changes."""
+
+
 class TrainingLogger:
     """metrics.jsonl, checkpoint and configuration of a run; only the first process writes."""
 
-    def __init__(self, config: TrainConfig, rank: int) -> None:
+    def __init__(self, config: RunOptions, rank: int) -> None:
         self.config, self.rank = config, rank
         self.path = config.out / "metrics.jsonl"
         self.file = config.out / "checkpoint.safetensors"
         self._board: Any = None
+        self.resumed: dict[str, Any] = {}
+        """What the checkpoint says beside its tensors."""
         if rank == 0:
             config.out.mkdir(parents=True, exist_ok=True)
             if config.tensorboard:
@@ -71,7 +108,7 @@ class TrainingLogger:
 
                 self._board = SummaryWriter(str(config.out / "tensorboard"))
 
-    def resume(self, model: Nolbo, stages: Sequence[TrainingStage]) -> tuple[int, dict[str, Any] | None, int]:
+    def resume(self, model: nn.Module, stages: Sequence[Named]) -> tuple[int, dict[str, Any] | None, int]:
         """Stage to go on with, the tensors of its state if it was under way, and its step.
 
         Raises:
@@ -102,9 +139,10 @@ class TrainingLogger:
         self._cut(number, at_step, stages)
         # The networks too: before a stage goes on, the shape guide in them teaches the latents of all shapes.
         model.load_state_dict(optimisation.module_tensors(tensors) if at_step else tensors)
+        self.resumed = meta
         return number, tensors if at_step else None, at_step
 
-    def _check(self, model: Nolbo, tensors: Mapping[str, Tensor], at_step: int) -> None:
+    def _check(self, model: nn.Module, tensors: Mapping[str, Tensor], at_step: int) -> None:
         """Raise `InputError` for a checkpoint of other networks, or with numbers that are not finite."""
         own = model.state_dict()
         if not at_step:
@@ -126,7 +164,7 @@ class TrainingLogger:
                     file=self.file,
                 )
 
-    def _cut(self, number: int, at_step: int, stages: Sequence[TrainingStage]) -> None:
+    def _cut(self, number: int, at_step: int, stages: Sequence[Named]) -> None:
         """Drop the rows of metrics that were written after the checkpoint: they will be written again."""
         if self.rank or not self.path.is_file():
             return
@@ -166,15 +204,15 @@ class TrainingLogger:
                 if isinstance(value, float):
                     self._board.add_scalar(f"{row['stage']}/{key}", value, row["step"])
 
-    def checkpoint(self, stage: int, state: StageRun | Nolbo) -> None:
+    def checkpoint(self, stage: int, state: UnderWay | nn.Module, more: Mapping[str, Any] | None = None) -> None:
         """Save a stage under way, or the networks between two stages."""
         if self.rank:
             return
-        if isinstance(state, StageRun):
-            tensors, step = optimisation.state_tensors(state.state), state.state.step
-        else:
+        if isinstance(state, nn.Module):
             tensors, step = state.state_dict(), 0
-        save_tensors(self.file, tensors, {"stage": stage, "step": step, "identity": self.config.identity()})
+        else:
+            tensors, step = optimisation.state_tensors(state.state), state.state.step
+        save_tensors(self.file, tensors, {**(more or {}), "stage": stage, "step": step, "identity": self.config.identity()})
 
     def close(self) -> None:
         """Close TensorBoard's files."""

@@ -20,7 +20,6 @@ from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, matrix_to_quaternion, viewpoint_to_matrix
-from nolbo_ppl.geometry.voxels import pack_voxels
 from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
 
 FIELD_OF_VIEW = float(np.radians(60.0))
@@ -61,6 +60,8 @@ class ArchiveImage:
     """What is labelled in it."""
     exhaustive: tuple[str, ...] | None = None
     """Categories of which every instance is labelled; None: of all."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy, px, where the archive states its camera."""
 
 
 def pascal_rotation(viewpoint: Sequence[float], box: Sequence[float], intrinsics: Sequence[float]) -> Float[np.ndarray, "3 3"]:
@@ -96,7 +97,7 @@ def scene_line(image: ArchiveImage, name: str, benchmark: bool = False) -> dict[
         name: path of the image in the folder of scenes.
         benchmark: truncated and occluded objects become regions to ignore, as the viewpoint benchmarks of PASCAL3D+ have it.
     """
-    camera = guessed_camera(image.size)
+    camera = guessed_camera(image.size) if image.intrinsics is None else list(image.intrinsics)
     limit = np.array([*image.size, *image.size], dtype=np.float64)
     objects, ignore = [], []
     for thing in image.objects:
@@ -132,7 +133,7 @@ def write_archive(
         out: folder, made when missing.
         images: what the archive holds.
         source: where it came from, for `source.json`.
-        shapes: [v, v, v] occupancy of each instance, canonical pose.
+        shapes: packed bits of the occupancy of each instance, canonical pose, all of one side.
         benchmark: truncated and occluded objects are regions to ignore.
 
     Returns:
@@ -159,7 +160,7 @@ def write_archive(
         raise input_error("an archive without images", got=out, expected="at least one annotated image")
     if shapes:
         with atomic_path(out / "voxels.npz") as temporary:
-            np.savez(temporary, **{name: pack_voxels(grid) for name, grid in shapes.items()})  # type: ignore[arg-type]
+            np.savez(temporary, **shapes)  # type: ignore[arg-type]
     write_json(out / "source.json", {**source, **counts})
     write_jsonl(out / "scenes.jsonl", lines)
     return {name: counts[name] for name in ("images", "objects", "viewpoints", "ignore")}
