@@ -59,6 +59,11 @@ def data_dir() -> Path:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With several workers the slow tests come first: at the end, one worker would run them while the others wait."""
+    """Tests of a GPU are skipped without one. With several workers the slow tests come first: at the end, one worker would run
+    them while the others wait."""
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="no CUDA device"))
     if hasattr(config, "workerinput"):
         items.sort(key=lambda item: item.get_closest_marker("slow") is None)
