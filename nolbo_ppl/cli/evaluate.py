@@ -16,6 +16,7 @@ import tyro
 from nolbo_ppl._version import __version__
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.evaluation.calibration_scores import calibration_table
 from nolbo_ppl.evaluation.instance_views import InstanceViews
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes, GeneratedScenes, Scenes
 from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
@@ -23,7 +24,7 @@ from nolbo_ppl.evaluation.peers import OnnxPeer
 from nolbo_ppl.evaluation.photograph_run import PhotographEvaluation, PhotographScenes, evaluate_photographs
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords, concatenate
 from nolbo_ppl.evaluation.retrieval import RetrievalRecords, retrieval_scores, retrieval_table, retrieve
-from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, score_intervals
+from nolbo_ppl.evaluation.scores import category_table, confusion, difficulty_table, judged, score_intervals
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.multiscale import MultiScalePredictor
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
@@ -31,6 +32,7 @@ from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import ModelConfig
+from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
@@ -192,7 +194,9 @@ def measure(config: EvaluateConfig, model: ObservationModel | MultiScalePredicto
                 decode=False,
                 batch=config.batch,
             )
-            objects.append(measure_objects([truth[k] for k in used], at_boxes, slots, [rows[k] for k in used], model))
+            numbers = [rows[k] for k in used]
+            tails = getattr(model, "calibration", Calibration()).position_tails
+            objects.append(measure_objects([truth[k] for k in used], at_boxes, slots, numbers, model, tails))
     if not objects:
         raise input_error(
             "no object to evaluate on",
@@ -248,6 +252,7 @@ def metrics(evaluation: Evaluation, config: EvaluateConfig) -> dict[str, Any]:
         "objects": len(evaluation.objects),
         "by_category": category_table(evaluation.objects, evaluation.detections, evaluation.categories),
         "by_difficulty": difficulty_table(evaluation.objects),
+        "calibration": calibration_table(evaluation.objects, evaluation.detections.all.select(judged(evaluation.detections.all))),
         "confusion": confusion(evaluation.objects, len(evaluation.categories)).tolist(),
         "retrieval": None if found is None else retrieval_table(found, evaluation.categories),
         "categories": list(evaluation.categories),

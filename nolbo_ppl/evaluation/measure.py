@@ -19,6 +19,7 @@ from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_vie
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels
 from nolbo_ppl.metrics.calibration import chi_square_mass, circular_crps
 from nolbo_ppl.metrics.detection import Matches, match
+from nolbo_ppl.metrics.heavy_tails import GAUSSIAN_DOF, StudentT
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_average_precision, voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture
@@ -49,6 +50,7 @@ def measure_objects(
     slots: Sequence[Int[np.ndarray, " _"]],
     scenes: Sequence[int],
     model: ShapeModel,
+    tails: StudentT | None = None,
 ) -> ObjectRecords:
     """Compare the answers at true boxes with the truth.
 
@@ -58,6 +60,7 @@ def measure_objects(
         slots: rows of the objects asked for.
         scenes: numbers of these scenes.
         model: decoder, prior means and shape autoencoder.
+        tails: law of the positions about their covariances, as the model's calibration states it; None: Gaussian.
 
     Raises:
         InputError: the lists do not match each other.
@@ -97,6 +100,7 @@ def measure_objects(
         rotation_error=error,
         tilt_mass=chi_square_mass(tilt, said("elevation_inplane_scale") ** 2),
         position_mass=chi_square_mass(position - said("position"), said("position_covariance")),
+        **_position_densities(position - said("position"), said("position_covariance"), tails),
         range_error=np.abs(np.linalg.norm(said("position"), axis=1) / distance - 1),
         depth_error=np.abs(depth / position[:, 2] - 1),
         # An image shows the ratio of distance and size: the true size takes the place of the estimated one.
@@ -105,6 +109,20 @@ def measure_objects(
         **orientation,
         **shape,
     )
+
+
+def _position_densities(
+    error: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"], tails: StudentT | None
+) -> dict[str, Float[np.ndarray, " n"]]:
+    """Log density of the truth under the Gaussian and under the law with tails, and the mass of the latter's region."""
+    squared = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    log_determinant = np.linalg.slogdet(2 * np.pi * covariance)[1]
+    law = tails or StudentT(GAUSSIAN_DOF, 1.0)
+    return {
+        "position_log_density": -0.5 * (squared + log_determinant),
+        "position_tails_mass": law.mass(squared, 3),
+        "position_tails_log_density": law.log_density(squared, log_determinant, 3),
+    }
 
 
 def _voxels(scene: Annotations) -> UInt8[np.ndarray, "m bytes"]:
@@ -173,7 +191,7 @@ def _shape(
     model: ShapeModel,
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Voxel figures and the mass of the latent's region, NaN where the true shape is unknown."""
-    names = ("latent_mass", "voxel_iou", "category_iou", "teacher_iou", "voxel_ap")
+    names = ("latent_mass", "latent_log_density", "voxel_iou", "category_iou", "teacher_iou", "voxel_ap")
     result = {name: np.full(len(category), np.nan) for name in names}
     rows = np.flatnonzero(packed.any(1))
     if not len(rows):
@@ -183,6 +201,9 @@ def _shape(
     truth = unpack_voxels(packed[rows], side)
     teacher, _ = model.shape_posterior(pack_voxels(_refined(truth, prior.shape[1])))
     result["latent_mass"][rows] = chi_square_mass(teacher - latent[rows], latent_scale[rows] ** 2)
+    spread = latent_scale[rows]
+    density = -0.5 * ((teacher - latent[rows]) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
+    result["latent_log_density"][rows] = density.sum(axis=1)
     decoded = _coarsened(model.decode(latent[rows]), side)
     result["voxel_iou"][rows] = voxel_iou(decoded, truth)
     result["voxel_ap"][rows] = voxel_average_precision(decoded, truth)

@@ -46,6 +46,12 @@ class ObjectRecords:
     """Mass of the region of elevation and in-plane rotation that reaches to the truth."""
     position_mass: Float[np.ndarray, " n"]
     """Mass of the region of the position that reaches to the truth."""
+    position_log_density: Float[np.ndarray, " n"]
+    """Log density of the position's Gaussian at the truth, nats per m^3."""
+    position_tails_mass: Float[np.ndarray, " n"]
+    """As `position_mass`, of the posterior with tails (Student's t) that the model's calibration states."""
+    position_tails_log_density: Float[np.ndarray, " n"]
+    """Its log density at the truth, nats per m^3."""
     range_error: Float[np.ndarray, " n"]
     """Relative error of the distance, absolute value."""
     depth_error: Float[np.ndarray, " n"]
@@ -54,6 +60,8 @@ class ObjectRecords:
     """The same, of the depth that follows when the object's true size is told."""
     latent_mass: Float[np.ndarray, " n"]
     """Mass of the region of the shape latent that reaches to the mean the shape autoencoder gives the true shape."""
+    latent_log_density: Float[np.ndarray, " n"]
+    """Log density of the latent's Gaussian at that mean, nats."""
     voxel_iou: Float[np.ndarray, " n"]
     """IoU of the decoded posterior mean."""
     category_iou: Float[np.ndarray, " n"]

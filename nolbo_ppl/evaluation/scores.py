@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl._moved import renamed
+from nolbo_ppl.evaluation.calibration_scores import calibration_estimates
 from nolbo_ppl.evaluation.records import DetectionRecords, ObjectRecords
 from nolbo_ppl.metrics.calibration import expected_calibration_error, top_label
 from nolbo_ppl.metrics.detection import Matches, average_precision
@@ -111,6 +112,8 @@ def score_intervals(
         "median_depth_error": pooled(objects.depth_error, median=True),
         "median_depth_error_known_size": pooled(objects.sized_depth_error, median=True),
     }
+    for name, value in calibration_estimates(objects, found.select(judged(found)), weights, rng).items():
+        result.setdefault(name, value)
     assert set(REQUIRED) <= set(result)
     return result
 

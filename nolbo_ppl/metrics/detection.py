@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,6 +35,11 @@ class Matches:
         """Matched to a truth that counts."""
         counted: np.ndarray = (self.truth >= 0) & ~self.ignored
         return counted
+
+    def select(self, rows: Bool[np.ndarray, " n"]) -> Matches:
+        """Some of the detections; the truths stay what they are."""
+        names = ("scene", "detection", "score", "truth", "ignored")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,11 @@ from torch import Tensor
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.fields import is_number
+from nolbo_ppl.metrics.heavy_tails import GAUSSIAN_DOF, StudentT
 from nolbo_ppl.models.observed_scene import RegionParameters
+
+CERTAIN = 1 - 1e-6
+"""Nothing is ever more certain than this."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,13 @@ class Calibration:
     shape_correlation: float = 0.0
     """Correlation of the shape latent's errors in two views of one object: what many views together can tell."""
 
+    position_dof: float = GAUSSIAN_DOF
+    """Degrees of freedom of Student's t about which true positions lie; 1e4: Gaussian."""
+    position_spread: float = 1.0
+    """Factor on the position's covariance that makes it the scale matrix of that law."""
+    objectness_limit: float = CERTAIN
+    """Probability of an object that is never exceeded: what held-out detections support."""
+
     def __post_init__(self) -> None:
         if not (is_number(self.shape_correlation) and 0 <= self.shape_correlation < 1):
             raise input_error("shape_correlation", got=self.shape_correlation, expected="a correlation from 0 to below 1")
@@ -44,12 +55,27 @@ class Calibration:
             value = getattr(self, field.name)
             if field.name == "shape_correlation":
                 continue
+            if field.name == "objectness_limit":
+                if not (is_number(value) and 0.5 <= value < 1):
+                    raise input_error("objectness_limit", got=value, expected="a probability from 0.5 to below 1")
+                continue
             if not (is_number(value) and abs(value) < 1e6) or (field.name != "objectness_shift" and value <= 0):
                 raise input_error(f"calibration factor {field.name}", got=value, expected="a positive finite number")
 
     def objectness(self, logit: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
         """Calibrated log odds of q(o | I)."""
         return self.objectness_slope * logit + self.objectness_shift
+
+    def limited(self, probability: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+        """Probabilities brought below `objectness_limit` in proportion, so that their order stays."""
+        return probability.clamp(max=CERTAIN) * (self.objectness_limit / CERTAIN)
+
+    @property
+    def position_tails(self) -> StudentT | None:
+        """Law of true positions about their covariances; None where nobody fitted one."""
+        if self.position_dof >= GAUSSIAN_DOF and self.position_spread == 1.0:
+            return None
+        return StudentT(self.position_dof, self.position_spread)
 
     def apply(self, q: RegionParameters) -> RegionParameters:
         """Calibrated posterior parameters."""

@@ -63,9 +63,12 @@ class ObjectMappingPipeline:
     @cached_property
     def slam_config(self) -> SlamConfig:
         """Settings of the EM, with what the model knows of its own views."""
-        if self.config.slam.latent_correlation is not None:
-            return self.config.slam
-        return dataclasses.replace(self.config.slam, latent_correlation=self.model.calibration.shape_correlation)
+        config, known = self.config.slam, self.model.calibration
+        if config.latent_correlation is None:
+            config = dataclasses.replace(config, latent_correlation=known.shape_correlation)
+        if config.position_tails is None and known.position_tails is not None:
+            config = dataclasses.replace(config, position_tails=(known.position_dof, known.position_spread))
+        return config
 
     def read(self, k: int) -> np.ndarray:
         """Image of a keyframe."""

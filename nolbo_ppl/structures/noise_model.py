@@ -38,5 +38,7 @@ class NoiseModel:
     """The same for orientations."""
     step_correlation: Float[np.ndarray, "s 6 6"] | None = None
     """Covariance of each odometry step in units of its scales, where the problem states covariances."""
+    position_dof: float | None = None
+    """Degrees of freedom of positions about their covariances, which are then scale matrices; None: Gaussian."""
     scale_walk: float | None = None
     """Standard deviation of the change of the factor on the odometry's steps from one to the next; None: steps are metric."""

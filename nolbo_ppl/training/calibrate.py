@@ -16,10 +16,11 @@ from nolbo_ppl.devices import placed
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.rotation import wrap_angle
 from nolbo_ppl.inference.posterior.decode import box_sigmas, position_covariance
+from nolbo_ppl.metrics.heavy_tails import GAUSSIAN_DOF, StudentT, fit_student_t, supported_probability
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import RegionParameters
-from nolbo_ppl.models.posterior_calibration import Calibration
+from nolbo_ppl.models.posterior_calibration import CERTAIN, Calibration
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, decode_box, decode_range
 
 MIN_OBJECTS = 50
@@ -207,6 +208,13 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
     range_scale = 1.0
     if len(found["position"]):
         range_scale = position_factor(found["position"], found["by_range"], box_scale**2 * found["by_box"])
+    tails = StudentT(GAUSSIAN_DOF, 1.0)
+    if len(found["position"]) >= MIN_OBJECTS:
+        covariance = range_scale**2 * found["by_range"] + box_scale**2 * found["by_box"]
+        error = found["position"]
+        squared = (error * torch.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
+        tails = fit_student_t(squared.numpy(), 3)
+    stated = torch.sigmoid(factor[0] * found["logit"] + shift)
     return Calibration(
         objectness_slope=factor[0],
         objectness_shift=shift,
@@ -217,4 +225,7 @@ def calibrate(model: Nolbo, batches: Iterable[SceneBatch]) -> Calibration:
         box_scale=box_scale,
         range_scale=range_scale,
         shape_correlation=_shape_correlation(found),
+        position_dof=tails.dof,
+        position_spread=tails.spread,
+        objectness_limit=min(supported_probability(stated.numpy(), found["is_object"].numpy()), CERTAIN),
     )

@@ -46,6 +46,27 @@ WORDS = {
     "median_range_error": "median relative error of the distance",
     "median_depth_error": "median relative error of the depth",
     "median_depth_error_known_size": "the same, the object's true size known",
+    "class_log_score": "log score of the category, nats (less is better)",
+    "objectness_log_score": "log score of objectness, nats",
+    "objectness_brier": "Brier score of objectness",
+    "position_log_score": "log score of the position's Gaussian, nats per m³",
+    "position_tails_log_score": "the same, of the law with tails",
+    "latent_log_score": "log score of the shape latent, nats",
+    "ece_objectness_if_perfect": "calibration error a perfect forecaster would show: objectness",
+    "ece_class_if_perfect": "the same: category",
+    "ece_objectness_debiased": "calibration error of objectness less what noise makes (root mean square)",
+    "ece_class_debiased": "the same: category",
+    **{
+        f"coverage{level}_{region}": f"truths in the {level} % region: {words}"
+        for region, words in (
+            ("orientation", "azimuth"),
+            ("tilt", "elevation, in-plane rotation"),
+            ("position", "position"),
+            ("position_tails", "position, law with tails"),
+            ("latent", "shape latent"),
+        )
+        for level in (50, 68, 90, 95, 99)
+    },
     "category_found": "category of the objects found",
     "false_without_objects": "detections above 0.5 in an image without objects",
     "viewpoint_found": "objects with a known azimuth that are found",

@@ -285,6 +285,17 @@ def test_coverage_of_exact_posteriors_is_nominal():
     for name in ("orientation", "tilt", "position", "latent"):
         figure = result.figures[f"coverage90_{name}"]
         assert figure.value == pytest.approx(0.9, abs=5 * math.sqrt(0.09 / figure.count)), name
+        for level in (50, 68, 95, 99):
+            value, p = result.figures[f"coverage{level}_{name}"], level / 100
+            assert value.value == pytest.approx(p, abs=5 * math.sqrt(p * (1 - p) / value.count)), (level, name)
+    regions = metrics(result, config())["calibration"]["regions"]
+    assert all(regions[name]["distance_from_uniform"] < 0.05 for name in ("tilt", "position", "latent"))
+    plain, tails = (result.figures[f"{name}_log_score"].value for name in ("position", "position_tails"))
+    assert tails == pytest.approx(plain, abs=0.01)  # nobody fitted tails: Gaussian
+    for name in ("class", "objectness"):
+        perfect = result.figures[f"ece_{name}_if_perfect"]
+        assert perfect.low < result.figures[f"ece_{name}"].value < 1.5 * perfect.high
+        assert result.figures[f"ece_{name}_debiased"].value < 0.03
     # A calibrated forecast has an expected calibration error of about 0.3 sqrt(bins / n), 0.03 here.
     assert result.figures["ece_class"].value < 0.04 and result.figures["ece_objectness"].value < 0.04
     # The log score of truths drawn from the mixture is its entropy: -sum w log(w f) for modes that hardly overlap.
@@ -307,6 +318,7 @@ def test_overconfidence_shows():
 
     value = {k: v.value for k, v in measure(config(), Oracle(scenes, viewpoints, spoil=spoil), scenes).figures.items()}
     assert value["coverage90_position"] < 0.4 and value["coverage90_latent"] < 0.2 and value["ece_class"] > 0.1
+    assert value["coverage99_position"] < 0.6 and value["ece_class_debiased"] > 0.08 > value["ece_class_if_perfect"]
 
 
 def test_small_and_hidden_objects_do_not_count():

@@ -49,6 +49,24 @@ def test_refusals(value: object) -> None:
         Calibration(shape_scale=value)  # type: ignore[arg-type]
 
 
+def test_certainty_is_brought_below_what_is_supported_and_the_order_stays() -> None:
+    probability = torch.tensor([0.1, 0.9, 0.999, 1.7], dtype=torch.float64)
+    limited = Calibration(objectness_limit=0.99).limited(probability)
+    assert (limited.diff() > 0).all() and float(limited.max()) == pytest.approx(0.99)
+    assert float(limited[0]) == pytest.approx(0.099, rel=1e-4)
+    unlimited = Calibration().limited(probability)
+    assert torch.equal(unlimited[:3], probability[:3]) and float(unlimited[3]) == 1 - 1e-6
+    for value in (1.0, 0.3, math.nan):
+        with pytest.raises(InputError, match="objectness_limit"):
+            Calibration(objectness_limit=value)
+
+
+def test_tails_of_positions_are_stated_where_they_were_fitted() -> None:
+    assert Calibration().position_tails is None
+    tails = Calibration(position_dof=3.0, position_spread=0.4).position_tails
+    assert tails is not None and (tails.dof, tails.spread) == (3.0, 0.4)
+
+
 def test_unknown_factors() -> None:
     with pytest.raises(InputError, match=r"unknown calibration factors.*slope"):
         Calibration.from_json({"slope": 1.0})

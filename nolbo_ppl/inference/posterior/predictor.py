@@ -288,7 +288,7 @@ class ObservationModel:
         probability = torch.sigmoid(logit[row, region].double())
         if not self.config.detector:
             probability = torch.zeros_like(probability).index_add_(0, stands_for, probability)
-        probability = probability.clamp(max=1 - 1e-6)
+        probability = self.calibration.limited(probability)
         kept = kept[probability[kept] > threshold]
         kept = kept[torch.argsort(probability[kept], descending=True, stable=True)]
         kept = kept[torch.argsort(row[kept], stable=True)]

@@ -116,7 +116,8 @@ class SingleObjectModel(ObservationModel):
                 at = self.device
                 region = self._networks.guide.responsible_region(encoding, rows.to(at), local.to(at)).cpu()
                 cameras = crops.camera(torch.as_tensor(camera, dtype=dtype).expand(len(box), 4))[part]
-                probability = torch.as_tensor(np.asarray(certainty), dtype=torch.float64)[part].clamp(1e-6, 1 - 1e-6)
+                probability = torch.as_tensor(np.asarray(certainty), dtype=torch.float64)[part].clamp_min(1e-6)
+                probability = self.calibration.limited(probability)
                 selected = SelectedRegions(
                     self._parameters(encoding, rows, region, local),
                     region,

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, skew, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, weighted_latents
-from nolbo_ppl.inference.slam.gaussian import log_normal, squared_distance
+from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import Linearisation, inflated
 from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
@@ -85,8 +85,9 @@ def detection_pairs(state: SlamState, linearisation: Linearisation, rng: np.rand
         prediction, S = _without_own(state, k, member[part], error, relative)
         square, log_det = squared_distance(prediction, S)
         inside = np.flatnonzero(square < GATE)
-        log_residual = log_normal(error[inside], seen.covariance[k[inside]])
-        out.append((start + inside, at[inside], -0.5 * (square + log_det)[inside], log_residual))
+        dof = state.noise.position_dof
+        log_residual = position_log_density(*squared_distance(error[inside], seen.covariance[k[inside]]), dof)
+        out.append((start + inside, at[inside], position_log_density(square, log_det, dof)[inside], log_residual))
     none = (np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     use, local, log_position, log_residual = (np.concatenate(x) for x in zip(*out)) if out else none
     row, landmark, member = row[use], landmark[use], member[use]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from nolbo_ppl.metrics.heavy_tails import student_log_density
+
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -20,6 +22,17 @@ def squared_distance(
     x, y, z = error[..., 0], error[..., 1], error[..., 2]
     square = (A * x * x + D * y * y + F * z * z + 2.0 * (B * x * y + C * x * z + E * y * z)) / determinant
     return np.maximum(square, 0.0), np.log(determinant) + 3.0 * LOG_2PI
+
+
+def position_log_density(
+    square: Float[np.ndarray, " n"], log_det: Float[np.ndarray, " n"], dof: float | None
+) -> Float[np.ndarray, " n"]:
+    """Log density of positions from squared distances and `log |2 pi S|`: Gaussian, or Student's t with `dof` degrees of freedom.
+
+    S may hold more than the detection's own scale matrix (where the landmark is): a t with the same degrees of freedom stands
+    for the sum, which is right where either of the two is small.
+    """
+    return -0.5 * (square + log_det) if dof is None else student_log_density(square, log_det, dof)
 
 
 def log_normal(error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."]:

@@ -18,11 +18,13 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import NolboError
-from nolbo_ppl.geometry.pose import make_pose, relative
+from nolbo_ppl.geometry.pose import inverse, make_pose, relative, transform
+from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import resolve_modes
 from nolbo_ppl.inference.slam.scale_state import add_scale_walk, scale_key, scaled_step_factor
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.metrics.heavy_tails import student_weight
 
 UNINFORMATIVE_ROTATION_SIGMA = 10.0
 """Scale of a rotation nobody observed, rad."""
@@ -140,6 +142,11 @@ def resolve_observations(
     S = inflated(seen.covariance[k], seen.position[k], noise.position_factor, noise.range_factor)
     covariance[:, 3:, 3:] = np.swapaxes(R, 1, 2) @ S @ R
     share = np.concatenate([np.ones(len(plain)), modes.responsibility])
+    if noise.position_dof is not None:
+        # Student's t as a mixture of Gaussians over scales: its mean precision given the error, frozen like every weight.
+        place = transform(inverse(estimate.T_world_camera[frame[k]]), estimate.T_world_landmark[landmark[k], :3, 3])
+        square, _ = squared_distance(place - seen.position[k], S)
+        share = share * student_weight(square, noise.position_dof)
     return ObservationFactors(frame[k], landmark[k], make_pose(R, seen.position[k]), covariance, weight[k] * share, k)
 
 

@@ -16,7 +16,7 @@ from nolbo_ppl.inference.slam.detection_features import (
     fit_prior,
     weighted_latents,
 )
-from nolbo_ppl.inference.slam.gaussian import log_normal
+from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import (
     LandmarkEqualities,
     Linearisation,
@@ -87,7 +87,7 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     seen = state.measurements.select(state.rows)
     T_camera_world = inverse(state.estimate.T_world_camera[seen.frame])
     error = transform(T_camera_world, state.estimate.T_world_landmark[state.landmark, :3, 3]) - seen.position
-    log_object = seen.log_object + log_normal(error, seen.covariance)
+    log_object = seen.log_object + position_log_density(*squared_distance(error, seen.covariance), state.noise.position_dof)
     log_background = seen.log_clutter + np.log(state.noise.clutter_rate)
     return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
 

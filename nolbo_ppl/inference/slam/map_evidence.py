@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, relative, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_latent, latent_log_density
-from nolbo_ppl.inference.slam.gaussian import squared_distance
+from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import Linearisation, linearise
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density
@@ -63,7 +63,7 @@ def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
     T = relative(state.estimate.T_world_camera[seen.frame], state.estimate.T_world_landmark[state.landmark])
     square, log_det = squared_distance(T[:, :3, 3] - seen.position, seen.covariance)
     factor = (noise.position_factor**2 * noise.range_factor) ** (1 / 3)
-    log_density = -0.5 * (square + log_det) / factor
+    log_density = position_log_density(square, log_det, noise.position_dof) / factor
     oriented = np.flatnonzero(seen.oriented)
     if len(oriented):
         modes, symmetry = seen.modes.select(oriented), seen.symmetry[oriented]

@@ -85,6 +85,9 @@ class SlamConfig:
     """Standard deviation of an observed position at range 0, m, for observations that state none."""
     position_ratio: float | None = None
     """Its growth with range, m per m."""
+    position_tails: tuple[float, float] | None = None
+    """Student's t in place of Gaussians for observed positions: degrees of freedom, and the factor on their stated covariances
+    that makes them its scale matrices. What a model's calibration found, in a run from images. None: Gaussian."""
     rotation_scale: float | None = None
     """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
     latent_scale: float | None = None
@@ -161,6 +164,11 @@ class SlamConfig:
             raise input_error("annealing", got=self.annealing, expected="one factor or more")
         for factor in self.annealing:
             _check_number("annealing", factor, 1e-3, 1e6, False)
+        if self.position_tails is not None:
+            if len(self.position_tails) != 2:
+                raise input_error("position_tails", got=self.position_tails, expected="degrees of freedom and a factor")
+            _check_number("position_tails", self.position_tails[0], 1.0, 1e9, False)
+            _check_number("position_tails", self.position_tails[1], 1e-4, 1e4, False)
         if self.objectness_prior is not None and not 0 < self.objectness_prior < 1:
             raise input_error("objectness_prior", got=self.objectness_prior, expected="a share between 0 and 1")
         if self.field_of_view is not None and not all(0 < angle <= 2 * np.pi for angle in self.field_of_view):

@@ -79,6 +79,9 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     report: dict[str, float] = {"pairs": float(len(pairs.first))}
     warnings: list[str] = []
     covariance = _position_covariance(table, pairs, config, report, warnings)
+    if config.position_tails is not None:  # what was stated is a covariance; the law with tails has a scale matrix
+        stated = np.isfinite(table.position_covariance).all(axis=(1, 2))
+        covariance = np.where(stated[:, None, None], covariance * config.position_tails[1], covariance)
     rotation_scale = _rotation_scale(problem, pairs, config, report, warnings)
     latent_scale = _latent_scale(table, pairs, config, report, warnings)
     volume = view_volume(table)
@@ -97,6 +100,7 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
         report=report,
         warnings=tuple(warnings),
         step_correlation=correlation,
+        position_dof=None if config.position_tails is None else config.position_tails[0],
     )
 
 
