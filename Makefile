@@ -53,12 +53,12 @@ DEPENDENCY_TESTS := tests/geometry tests/io tests/structures tests/inference/sla
 test-lowest:
 	$(PYTHON) -m venv build/lowest
 	$(PYTHON) tools/lower_bounds.py > build/lowest.txt
-	build/lowest/bin/python -m pip install --quiet -c build/lowest.txt -e . pytest hypothesis mpmath
+	build/lowest/bin/python -m pip install --quiet -c build/lowest.txt -e . pytest hypothesis mpmath beartype
 	OMP_NUM_THREADS=1 build/lowest/bin/python -m pytest -q -W default $(DEPENDENCY_TESTS)
 
 test-newest:
 	$(PYTHON) -m venv build/newest
-	build/newest/bin/python -m pip install --quiet --upgrade -e . pytest hypothesis mpmath
+	build/newest/bin/python -m pip install --quiet --upgrade -e . pytest hypothesis mpmath beartype
 	OMP_NUM_THREADS=1 build/newest/bin/python -m pytest -q $(DEPENDENCY_TESTS)
 
 # Known vulnerabilities of what a user gets (asks the advisory database of the package index).
