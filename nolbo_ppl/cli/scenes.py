@@ -12,7 +12,7 @@ from typing import Any, Literal
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.synthetic.assets.shape_library import INSTANCES
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
-from nolbo_ppl.synthetic.scenes.scene_config import preset
+from nolbo_ppl.synthetic.scenes.scene_config import photographic, preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
 
@@ -39,6 +39,9 @@ class ScenesConfig:
     """Height and width of the images, px; a multiple of 32."""
     difficulty: Literal["easy", "standard", "full"] = "standard"
     """How hard: from upright objects on plain ground to heavy clutter, occlusion, truncation and coloured light."""
+    photographic: bool = False
+    """As a phone would take them: motion, noise, poor exposure, vignetting, JPEG; daylight that goes with the sky; people and
+    plants before the objects. Wants 320 px and more."""
     instances: int = INSTANCES
     """Generated shapes a category."""
     workers: int = max(1, min(8, os.cpu_count() or 1))
@@ -53,7 +56,9 @@ def source_of(config: ScenesConfig) -> SceneGenerator:
 
         cad = tuple(load_cad_folder(config.cad, CATEGORIES, up=config.up, front=config.front))
     backgrounds = None if config.backgrounds is None else str(config.backgrounds)
-    return SceneGenerator(preset(config.difficulty, config.size), config.seed, config.instances, backgrounds, cad)
+    scenes = preset(config.difficulty, config.size)
+    scenes = photographic(scenes) if config.photographic else scenes
+    return SceneGenerator(scenes, config.seed, config.instances, backgrounds, cad)
 
 
 def run(config: ScenesConfig) -> dict[str, Any]:

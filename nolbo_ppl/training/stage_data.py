@@ -21,6 +21,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, rendered_size
+from nolbo_ppl.synthetic.scenes.scene_config import photographic
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
@@ -73,6 +74,7 @@ class TrainingData:
                 base = scene_preset(kind, size)
                 if mixed and kind == "full":  # CAD without materials, and photographs, look like no other generated scene
                     base = dataclasses.replace(base, single_material=0.25, photographs=0.85)
+                base = photographic(base) if config.photographic else base
                 behind = None if mixed and kind == "standard" else photographs
                 sources.append(SceneGenerator(base, seed, backgrounds=behind))
         if mixed:

@@ -40,7 +40,18 @@ FREE_FIELDS = (
 """Fields a resumed run may change: they do not touch what is learnt."""
 NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False}
 """Fields that a checkpoint need not name where they have these values, for the same reason as `OPTIONAL_FIELDS`."""
-OPTIONAL_FIELDS = ("categories", "symmetry", "grow", "detector", "scenes", "mix", "render_sizes", "unlabelled", "evidence_scenes")
+OPTIONAL_FIELDS = (
+    "categories",
+    "symmetry",
+    "grow",
+    "detector",
+    "scenes",
+    "mix",
+    "render_sizes",
+    "unlabelled",
+    "photographic",
+    "evidence_scenes",
+)
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
@@ -92,6 +103,8 @@ class TrainConfig:
     single folder stands alone, several have equal shares."""
     render_sizes: tuple[int, ...] = ()
     """Sides, px, at which generated scenes are rendered, as many of each; 128 or less by default."""
+    photographic: bool = False
+    """Generated scenes as a phone would take them (see `nolbo scenes --photographic`)."""
     validation: Path | None = None
     """Folder of held-out scenes; with `scenes` and without this, the last tenth of `scenes` is held out."""
     count: int = 16384

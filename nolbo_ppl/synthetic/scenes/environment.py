@@ -37,6 +37,31 @@ def sample_light(
     return tuple(lights), sky, sky * rng.uniform(0.3, 0.8)
 
 
+def daylight(
+    lights: tuple[Light, ...], backdrop: Environment, up: Float[np.ndarray, " 3"], rng: np.random.Generator
+) -> tuple[tuple[Light, ...], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Lights and ambient light that go with a sky: the sun where the first light was, redder and weaker the lower it stands,
+    or an overcast sky without one; from below what the ground throws back.
+
+    Args:
+        lights: lights drawn before; the direction of the first one is the sun's.
+        backdrop: the sky and the ground.
+        up: the world's up in the camera frame.
+        rng: draws the weather.
+    """
+    sky = np.asarray(backdrop.zenith, dtype=np.float64)
+    ground = np.asarray(backdrop.ground.colours, dtype=np.float64).mean(0)
+    if rng.random() < 0.35:
+        grey = sky.mean() * rng.uniform(0.9, 1.3) + 0.1
+        above = np.full(3, grey) + 0.15 * (sky - sky.mean())
+        return (), above, above * ground
+    sine = float(np.clip(lights[0].direction @ up, 0.0, 1.0))
+    height = min(sine / 0.5, 1.0)  # from 30 degrees on it is as white as it gets
+    colour = np.array([1.0, 0.62 + 0.34 * height, 0.32 + 0.56 * height]) * rng.uniform(0.7, 1.2) * (0.45 + 0.55 * height)
+    above = rng.uniform(0.25, 0.5) * (0.7 * sky / max(float(sky.max()), 1e-3) + 0.1)
+    return (Light(lights[0].direction, colour),), above, ground * (above + 0.5 * sine * colour)
+
+
 def _two_colours(rng: np.random.Generator, muted: bool) -> np.ndarray:
     """Two related albedos of a ground or wall."""
     hue = rng.choice([0.08, 0.1, 0.12, 0.25, 0.3, 0.6]) + rng.normal(0, 0.03) if muted else rng.random()

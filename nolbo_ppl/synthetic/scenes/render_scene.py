@@ -18,6 +18,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.synthetic.assets.shape_library import ShapeAsset
 from nolbo_ppl.synthetic.renderer.camera_view import MeshInstance, View
+from nolbo_ppl.synthetic.renderer.lens import LOSSLESS, compressed, motion_blurred, vignetted
 from nolbo_ppl.synthetic.renderer.ray_casting import Hits, average_down, image_window, shade, to_display, trace
 
 
@@ -47,6 +48,11 @@ class Scene:
     supersample: int
     least_visibility: float
     least_box: float
+    motion: tuple[float, float] = (0.0, 0.0)
+    """Path (x, y) of the camera during the exposure, px."""
+    vignetting: float = 0.0
+    """Share of the light that is lost in the corners."""
+    jpeg_quality: int = LOSSLESS
 
 
 @dataclass(frozen=True)
@@ -216,8 +222,9 @@ def render_scene(scene: Scene) -> Rendered:
     factor = scene.supersample
     view, hits, visibility = _seen_objects(scene, _fine(scene.view, factor))
     colour = _blurred(average_down(shade(view, hits), factor), scene.blur)
+    colour = vignetted(motion_blurred(colour, np.array(scene.motion)), scene.vignetting)
     noise = np.random.default_rng(scene.noise_seed).standard_normal(colour.shape, dtype=np.float32)
-    image = to_display(colour, scene.exposure, np.float32(scene.noise) * noise)
+    image = compressed(to_display(colour, scene.exposure, np.float32(scene.noise) * noise), scene.jpeg_quality)
     labels: list[ObjectLabel] = []
     number = np.full(len(view.placed) + 1, -1)
     for k, placed in enumerate(view.placed):

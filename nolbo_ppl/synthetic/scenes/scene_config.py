@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
@@ -77,6 +78,16 @@ class SceneConfig:
     """Greatest scale of the sensor noise, over full range."""
     supersample: int = 1
     """Rays a pixel along each side; 2 costs four times the rays and removes jagged edges."""
+    motion_blur: float = 0.0
+    """Greatest path of the camera during the exposure, px."""
+    vignetting: float = 0.0
+    """Greatest share of the light that is lost in the corners."""
+    jpeg_quality: tuple[int, int] = (100, 100)
+    """Quality of the compression; 100 is none."""
+    occluders: int = 0
+    """Greatest number of people and plants in a scene."""
+    daylight: float = 0.0
+    """Share of scenes in the open that are lit by the sky they show: a sun whose colour follows its height, or clouds alone."""
 
     def __post_init__(self) -> None:
         if self.size <= 0 or self.size % 32:
@@ -88,6 +99,19 @@ class SceneConfig:
             raise input_error("number of objects a scene", got=self.objects, expected="least <= greatest <= 8")
         if self.supersample < 1:
             raise input_error("rays a pixel", got=self.supersample, expected="at least 1")
+        if not 1 <= self.jpeg_quality[0] <= self.jpeg_quality[1] <= 100:
+            raise input_error("jpeg_quality", got=self.jpeg_quality, expected="1 <= least <= greatest <= 100")
+        if not (0 <= self.vignetting <= 1 and 0 <= self.daylight <= 1):
+            raise input_error("vignetting and daylight", got=(self.vignetting, self.daylight), expected="shares from 0 to 1")
+        if self.motion_blur < 0 or self.occluders < 0:
+            raise input_error("motion_blur and occluders", got=(self.motion_blur, self.occluders), expected="at least 0")
+
+    def described(self) -> dict[str, Any]:
+        """All fields by name, those that are newer than some caches only where they differ from their default."""
+        values = asdict(self)
+        newer = ("motion_blur", "vignetting", "jpeg_quality", "occluders", "daylight")
+        defaults = {field.name: field.default for field in fields(self)}
+        return {name: value for name, value in values.items() if name not in newer or value != defaults[name]}
 
 
 def easy(size: int = 128) -> SceneConfig:
@@ -142,6 +166,25 @@ def full(size: int = 128) -> SceneConfig:
         exposure=(0.5, 1.6),
         blur=0.9,
         noise=0.035,
+    )
+
+
+def photographic(config: SceneConfig) -> SceneConfig:
+    """The same scenes as a phone would take them: motion, noise, poor exposure, vignetting, JPEG; daylight, people, plants.
+
+    Lengths in px are those of 320 px, and follow the size.
+    """
+    share = config.size / 320
+    return replace(
+        config,
+        exposure=(0.45, 1.7),
+        blur=max(config.blur, 1.4 * share),
+        noise=max(config.noise, 0.04),
+        motion_blur=7.0 * share,
+        vignetting=0.5,
+        jpeg_quality=(30, 95),
+        occluders=2,
+        daylight=0.7,
     )
 
 

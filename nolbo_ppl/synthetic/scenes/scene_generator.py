@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,7 +64,7 @@ class SceneGenerator:
             folder = Path(self.backgrounds)
             pictures = [f"{path.relative_to(folder)}:{path.stat().st_size}" for path in self.photographs.paths]
         return {
-            "config": asdict(self.config),
+            "config": self.config.described(),
             "seed": self.seed,
             "shapes": self.pool.describe(),
             "pictures": list(pictures),

@@ -11,11 +11,12 @@ from jaxtyping import Float
 
 from nolbo_ppl.synthetic.assets.shape_library import BLOCK, ShapeLibrary
 from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance, View
-from nolbo_ppl.synthetic.renderer.materials import sample_material, sample_materials
+from nolbo_ppl.synthetic.renderer.materials import Material, sample_material, sample_materials
 from nolbo_ppl.synthetic.scenes import distractors as clutter
 from nolbo_ppl.synthetic.scenes.background_images import Photographs
-from nolbo_ppl.synthetic.scenes.environment import sample_environment, sample_light
+from nolbo_ppl.synthetic.scenes.environment import daylight, sample_environment, sample_light
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
+from nolbo_ppl.synthetic.scenes.occluders import sample_occluder
 from nolbo_ppl.synthetic.scenes.render_scene import Scene, SceneObject
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
 
@@ -176,6 +177,28 @@ def _distractors(composer: _Composer, config: SceneConfig, rng: np.random.Genera
     ]
 
 
+def _occluder(composer: _Composer, config: SceneConfig, rng: np.random.Generator) -> list[MeshInstance]:
+    """Draw a person or a plant and its place."""
+    parts, roles, box = sample_occluder(rng)
+    R_world_local = _vertical(rng.uniform(-np.pi, np.pi))
+    texture_seed = int(rng.integers(2**31))
+    place = composer.place(box[1] - box[0], R_world_local, _pixel_range(config.object_pixels, config.size), False)
+    if place is None:
+        return []
+    centre, diagonal = place
+    linear = composer.R_camera_world @ R_world_local * diagonal
+    clothes: dict[str, Material] = {}
+    placed = []
+    for part, role in zip(parts, roles):
+        material = clothes.setdefault(role, sample_material(role, rng)) if role != "fabric" else sample_material(role, rng)
+        placed.append(
+            MeshInstance(
+                _unit_mesh(part.kind), linear @ part.linear, linear @ part.offset + centre, (material,), -1, texture_seed
+            )
+        )
+    return placed
+
+
 def sample_scene(
     config: SceneConfig,
     rng: np.random.Generator,
@@ -204,8 +227,13 @@ def sample_scene(
             placed.append(found[1])
     for _ in range(int(rng.integers(config.clutter[0], config.clutter[1] + 1))):
         placed.extend(_distractors(composer, config, rng))
+    own = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
+    for _ in range(int(own.integers(config.occluders + 1)) if config.occluders else 0):
+        placed.extend(_occluder(composer, config, own))
     lights, ambient_sky, ambient_ground = sample_light(config, rng, composer.R_camera_world)
     backdrop = sample_environment(config, rng, composer.R_camera_world, photographs)
+    if config.daylight and own.random() < config.daylight and backdrop.picture is None and backdrop.wall is None:
+        lights, ambient_sky, ambient_ground = daylight(lights, backdrop, composer.up, own)
     angle = rng.uniform(-np.pi, np.pi)
     view = View(
         height=config.size,
@@ -220,6 +248,7 @@ def sample_scene(
         ambient_ground=ambient_ground,
         backdrop=backdrop,
     )
+    turn, length = own.uniform(-np.pi, np.pi), own.uniform(0, config.motion_blur) if config.motion_blur else 0.0
     return Scene(
         view=view,
         objects=tuple(objects),
@@ -230,6 +259,9 @@ def sample_scene(
         supersample=config.supersample,
         least_visibility=config.least_visibility,
         least_box=config.least_box,
+        motion=(length * np.cos(turn), length * np.sin(turn)),
+        vignetting=own.uniform(0, config.vignetting) if config.vignetting else 0.0,
+        jpeg_quality=int(own.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1)),
     )
 
 
