@@ -20,8 +20,7 @@ from nolbo_ppl.devices import each_pinned
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
-from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, rendered_size
-from nolbo_ppl.synthetic.scenes.scene_config import photographic
+from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, photographic, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
