@@ -109,7 +109,6 @@ def measured_graph(state: SlamState) -> tuple[gtsam.NonlinearFactorGraph, Observ
     """Odometry, weighted observations and weak priors of a state, in this order, and the observations' factors."""
     factors = resolve_observations(
         state.measurements,
-        state.problem.odometry,
         state.noise,
         state.config,
         state.estimate,
@@ -119,5 +118,5 @@ def measured_graph(state: SlamState) -> tuple[gtsam.NonlinearFactorGraph, Observ
     )
     graph = odometry_factors(state.problem, state.noise)
     add_observation_factors(graph, factors)
-    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range)
+    add_landmark_priors(graph, state.estimate.T_world_landmark, state.typical_range, state.features.oriented)
     return graph, factors

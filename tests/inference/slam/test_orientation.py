@@ -135,7 +135,7 @@ def test_gradient_of_the_split_factor_is_that_of_the_mixture() -> None:
     T = make_pose(so3_exp(0.2 * Z), np.array([0.0, 0.0, 5.0]))
     estimate, zero = SlamEstimate(np.eye(4)[None], T[None]), np.zeros(1, int)
     measurements = resolve(table, noise, CONFIG, fit_prior(table, CONFIG, noise))
-    factors = resolve_observations(measurements, problem.odometry, noise, CONFIG, estimate, zero, zero, np.ones(1))
+    factors = resolve_observations(measurements, noise, CONFIG, estimate, zero, zero, np.ones(1))
     assert len(factors.weight) >= 2 and factors.weight.sum() == pytest.approx(1.0)
 
     def quadratic(angle: float) -> float:

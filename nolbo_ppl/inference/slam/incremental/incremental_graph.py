@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import adjoint, inverse
 from nolbo_ppl.inference.slam.graph import (
+    FIRM_ROTATION_SIGMA,
     GAUGE_SCALE,
     PRIOR_POSITION_RATIO,
     PRIOR_ROTATION,
@@ -148,10 +149,11 @@ class IncrementalGraph:
         self.add(Factor(STEP, self.poses - 1, self.poses, step, covariance))
         self.poses += 1
 
-    def add_landmark(self, T_world_landmark: Float[np.ndarray, "4 4"], distance: float) -> int:
-        """A new landmark with its weak prior; returns its number."""
+    def add_landmark(self, T_world_landmark: Float[np.ndarray, "4 4"], distance: float, oriented: bool = True) -> int:
+        """A new landmark with its weak prior, firm on a rotation that nobody will observe; returns its number."""
         self.first_values[landmark_key(self.landmarks)] = T_world_landmark
-        sigmas = np.array([PRIOR_ROTATION * UNINFORMATIVE_ROTATION_SIGMA] * 3 + [PRIOR_POSITION_RATIO * max(distance, 1e-3)] * 3)
+        rotation = PRIOR_ROTATION * UNINFORMATIVE_ROTATION_SIGMA if oriented else FIRM_ROTATION_SIGMA
+        sigmas = np.array([rotation] * 3 + [PRIOR_POSITION_RATIO * max(distance, 1e-3)] * 3)
         self.add(Factor(PRIOR, self.landmarks, -1, T_world_landmark, np.diag(sigmas**2)))
         self.landmarks += 1
         return self.landmarks - 1
@@ -171,9 +173,7 @@ class IncrementalGraph:
             return np.zeros((0, 4, 4))
         estimate = SlamEstimate(T_world_camera[None], np.array([self.landmark(j) for j in landmarks]))
         count = len(rows)
-        found = resolve_observations(
-            measurements, T_world_camera[None], noise, config, estimate, np.array(rows), np.arange(count), np.ones(count)
-        )
+        found = resolve_observations(measurements, noise, config, estimate, np.array(rows), np.arange(count), np.ones(count))
         self._add_observations(found, frame, landmarks)
         return estimate.T_world_landmark
 

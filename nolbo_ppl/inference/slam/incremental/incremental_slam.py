@@ -47,6 +47,8 @@ from nolbo_ppl.structures.landmark import Landmark
 
 MOST_WAIT = 5
 """Detections a track gathers at most before it founds a landmark, where a known one may be there but is not sure."""
+LATELY = 50
+"""A detector that gave no orientation in so many frames gives none."""
 
 
 @dataclass(frozen=True)
@@ -298,7 +300,8 @@ class IncrementalSlam(IncrementalMemory):
                 self.loops.met(landmark, T[:3, 3], noise)
                 met += 1
             elif alone > SURE_WEIGHT or len(track.waiting) >= MOST_WAIT:
-                number = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])))
+                oriented = any(one.has_rotation.any() for one in self.tables[-LATELY:])
+                number = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])), oriented)
                 track.landmark = track.draft.number = number
                 track.draft.place = self.loops.drift.place
                 self.loops.add(track.draft, T[:3, 3])
