@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,16 +23,14 @@ from nolbo_ppl.data.converters import (
     write_converted,
 )
 from nolbo_ppl.data.converters.foreign_detections import DetectionFormat, observations_of, read_foreign_detections
-from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.distortion import undistort_boxes
+from nolbo_ppl.data.converters.placed_boxes import observations_by_parallax, read_heights, undistorted
 from nolbo_ppl.io.camera_files import read_camera
-from nolbo_ppl.io.fields import number_array
-from nolbo_ppl.io.files import read_json, read_json_object, write_json
+from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.images import images_of
 from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.text import read_words
-from nolbo_ppl.io.trajectories import COVARIANCE
+from nolbo_ppl.io.trajectories import COVARIANCE, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -178,7 +176,7 @@ class YcbvSlam:
 
 @dataclass(frozen=True)
 class ForeignFile:
-    """Detections of another detector (COCO, YOLO, KITTI, Omni3D, OA-SLAM) as observations for `nolbo slam`."""
+    """Detections of another detector (COCO, YOLO, KITTI, Omni3D, OA-SLAM, JSON Lines) as observations for `nolbo slam`."""
 
     data: Path
     """The file; of YOLO and KITTI also the folder of files."""
@@ -193,7 +191,10 @@ class ForeignFile:
     names: Path | None = None
     """Names of the categories, one a line, in order of their numbers; COCO's by default."""
     heights: Path | None = None
-    """JSON: height and standard deviation, m, by category; everyday values by default. Boxes alone need them."""
+    """JSON: height and standard deviation, m, by category. Without `--odometry` boxes alone need them; everyday values are the
+    default then."""
+    odometry: Path | None = None
+    """Odometry, a row an image: boxes alone are triangulated, with the heights that are given, or without any."""
     minimum_score: float = 0.3
     """Detections below are left out."""
 
@@ -201,19 +202,16 @@ class ForeignFile:
         """Run it and say what was written."""
         camera = read_camera(self.intrinsics)
         size = (camera.width, camera.height) if camera.width and camera.height else None
-        heights = None
-        if self.heights is not None:
-            given = read_json(self.heights)
-            values = number_array(list(given.values()) if isinstance(given, dict) else None, (None, 2))
-            if values is None or not (values > 0).all():
-                raise input_error("heights", expected='{"category": [height, standard deviation], ...} in m', file=self.heights)
-            heights = {name: (float(h), float(s)) for name, (h, s) in zip(given, values)}
+        heights = None if self.heights is None else read_heights(self.heights)
         names = None if self.names is None else [" ".join(words) for _, words in read_words(self.names)]
         images = None if self.images is None else [path.name for path in images_of(self.images)]
         found = read_foreign_detections(self.data, self.format, images=images, names=names, size=size)
-        if camera.model is not None:
-            found = replace(found, box=undistort_boxes(found.box, camera.vector, camera.model, camera.distortion))
-        table, left_out = observations_of(found, camera.vector, size, heights, self.minimum_score)
+        found = undistorted(found, camera)
+        if self.odometry is None:
+            table, left_out = observations_of(found, camera.vector, size, heights, self.minimum_score)
+        else:
+            poses = read_trajectory(self.odometry).T_world_camera
+            table, left_out = observations_by_parallax(found, poses, camera.vector, size, heights, self.minimum_score)
         write_observations(self.out / "observations.jsonl", table)
         write_json(self.out / "source.json", {"kind": "detections", "format": self.format, "left_out": left_out})
         reasons = "".join(f", {count} left out {why}" for why, count in left_out.items() if count)

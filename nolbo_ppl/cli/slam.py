@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING
 import tyro
 
 from nolbo_ppl._moved import renamed
+from nolbo_ppl.data.converters.placed_boxes import read_heights
+from nolbo_ppl.data.slam_inputs import read_slam_inputs
 from nolbo_ppl.evaluation.map_calibration import map_calibration
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import RESULT, is_result, write_result
-from nolbo_ppl.io.observations import read_observations
 from nolbo_ppl.io.output_folder import output_folder
+from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
-from nolbo_ppl.io.trajectories import TIME_TOLERANCE, Trajectory, read_covariance, read_frame_poses, read_trajectory
+from nolbo_ppl.io.trajectories import TIME_TOLERANCE, Trajectory, read_covariance, read_frame_poses
 from nolbo_ppl.io.trajectory_tables import TableFormat
 from nolbo_ppl.io.true_objects import read_true_objects
 
@@ -29,12 +31,19 @@ class SlamRunConfig:
     """Odometry: KITTI (12 numbers a row), 4 x 4 (16), TUM (`time x y z qx qy qz qw`) or EuRoC (CSV, ns, q_w first);
     T_world_camera, x right, y down, z forward."""
     observations: Path
-    """Observations: JSON Lines, one detection a line (see docs/slam.md)."""
+    """Observations: JSON Lines, one detection a line (see docs/slam.md), with positions, or boxes or masks alone; or
+    `BAG:/topic` of detections (vision_msgs), whose messages are then the frames."""
     out: Path
     """Folder for trajectory.txt, landmarks.json, associations.jsonl, summary.json and map.png."""
     odometry_covariance: Path | None = None
     """Covariance of every odometry step: NPZ with `covariance` [n - 1, 6, 6], [rotation rad, translation m] at the later
     camera."""
+    intrinsics: Path | None = None
+    """The camera, for boxes alone: their objects are triangulated by the odometry."""
+    heights: Path | None = None
+    """JSON: height and standard deviation, m, by category, for boxes alone, of those that are known."""
+    minimum_score: float = 0.0
+    """Boxes below are left out."""
     truth: Path | None = None
     """True trajectory, for errors before and after: matched by time where both have times, else row by row. Frames without
     truth, and rows of nothing but nan or inf, are left out of the errors."""
@@ -74,15 +83,23 @@ def run(arguments: SlamRunConfig) -> tuple[SlamResult, dict[str, object]]:
         arguments.odometry_covariance,
         arguments.truth,
         arguments.truth_objects,
+        arguments.intrinsics,
     )
     with output_folder(arguments.out, RESULT, is_own=is_result, inputs=inputs) as folder:
         return _solve(arguments, folder)
 
 
 def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str, object]]:
-    odometry = read_trajectory(arguments.odometry, arguments.odometry_format)
-    table = read_observations(arguments.observations, frames=len(odometry))
-    truth, remarks = None, []
+    given = read_slam_inputs(
+        arguments.odometry,
+        arguments.observations,
+        form=arguments.odometry_format,
+        intrinsics=arguments.intrinsics,
+        heights=None if arguments.heights is None else read_heights(arguments.heights),
+        minimum_score=arguments.minimum_score,
+        causal=arguments.online,
+    )
+    odometry, table, remarks, truth = given.odometry, given.detections, list(given.remarks), None
     if arguments.truth is not None:
         found = read_frame_poses(
             arguments.truth,
@@ -90,10 +107,11 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
             odometry.times,
             form=arguments.truth_format,
             tolerance=arguments.time_tolerance,
-            interpolate=arguments.truth_interpolation,
+            interpolate=arguments.truth_interpolation or is_bag(arguments.truth),
             of="the odometry",
         )
-        truth, remarks = found.T_world_camera, found.remarks()
+        truth = found.T_world_camera
+        remarks += found.remarks()
     covariance = None if arguments.odometry_covariance is None else read_covariance(arguments.odometry_covariance)
     problem = SlamProblem(odometry.T_world_camera, table, covariance)
     objects = None if arguments.truth_objects is None else read_true_objects(arguments.truth_objects, table.id)
