@@ -220,10 +220,10 @@ def kitti(arguments: Arguments, name: str) -> dict[str, Any]:
             truth=inputs / "truth.txt",
             out=out,
             model=arguments.model,
-            sizes=arguments.sizes,
+            test_sizes=arguments.sizes,
             usual_heights=arguments.usual_heights,
             visual=VISUAL,
-            every=arguments.every,
+            frame_stride=arguments.every,
             **given,
         )
     )
@@ -256,7 +256,7 @@ def desk(arguments: Arguments) -> dict[str, Any]:
             model=arguments.model,
             usual_heights=arguments.usual_heights,
             visual=VISUAL,
-            every=arguments.every,
+            frame_stride=arguments.every,
         )
     )
     run = RunFolder(arguments.out / "fr1-visual")

@@ -78,7 +78,7 @@ for site, parents in relations["sample_sample"].items():
 
 
 # %%
-def trained(loss, steps: int = 28):
+def trained(loss, steps: int = 40):
     """A model of the same start after some steps of SVI, and the losses on the way."""
     own = Nolbo.from_seed(config, seed=0)
     svi = SVI(own.story, own.guide, ClippedAdam({"lr": 2e-3, "clip_norm": 50.0}), loss=loss)

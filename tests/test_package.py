@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "nolbo_ppl"
 
 LAYERS = (
-    ("errors", "_version", "_moved", "categories", "citations", "parallel", "progress", "devices"),
+    ("errors", "_version", "_moved", "categories", "citations", "parallel", "progress", "devices", "renamed_options"),
     ("geometry",),
     ("structures",),
     ("io",),

@@ -34,6 +34,7 @@ from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.renamed_options import current_arguments, renamed_options
 from nolbo_ppl.synthetic.scenes.scene_config import preset, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
@@ -41,13 +42,14 @@ SEED = 9001
 """Default seed of generated scenes: neither the scenes nor the shapes of another seed are among them."""
 
 
+@renamed_options(sizes="test_sizes", threshold="score_threshold")
 @dataclass(frozen=True)
 class EvaluateConfig:
     """Evaluate a model on scenes it has not seen and write figures, plots and examples.
 
     Example:
         >>> import nolbo_ppl
-        >>> nolbo_ppl.EvaluateConfig("figures", model="tiny", count=200).threshold
+        >>> nolbo_ppl.EvaluateConfig("figures", model="tiny", count=200).score_threshold
         0.01
     """
 
@@ -82,7 +84,7 @@ class EvaluateConfig:
     """The axis that their front faces; by default +z of files with y up, -y of those with z up."""
     backgrounds: Path | None = None
     """Folder of photographs behind generated scenes."""
-    sizes: tuple[int, ...] = ()
+    test_sizes: tuple[int, ...] = ()
     """Longer sides, px, images are brought to; the network's own size by default. With several, each answers for the
     objects it shows at a trained size: `256 640` for street images 1242 px wide."""
     retrieval: bool = False
@@ -93,7 +95,7 @@ class EvaluateConfig:
     """Objects whose box has no side of so many px do not count, nor does a detection of them."""
     least_visibility: float = 0.5
     """Objects of which less is seen do not count either."""
-    threshold: float = 0.01
+    score_threshold: float = 0.01
     """Least objectness of a detection."""
     resamples: int = 500
     """Bootstrap resamples of the scenes behind the intervals."""
@@ -177,7 +179,7 @@ def measure(config: EvaluateConfig, model: ObservationModel | MultiScalePredicto
         rows = range(start, min(start + config.batch, len(scenes)))
         truth = [scenes[i] for i in rows]
         images, cameras = [scene.image for scene in truth], np.array([scene.intrinsics for scene in truth])
-        found = model.observe(images, cameras, threshold=config.threshold, decode=False, batch=config.batch)
+        found = model.observe(images, cameras, threshold=config.score_threshold, decode=False, batch=config.batch)
         answers += [(one.box, one.objectness, one.class_posterior) for one in found]
         counted = [scene.counts(config.least_side, config.least_visibility) for scene in truth]
         boxes += [scene.box for scene in truth]
@@ -305,7 +307,7 @@ def run(config: EvaluateConfig) -> Evaluation:
 
 def _evaluate(config: EvaluateConfig, folder: Path) -> Evaluation:
     loaded = load(config.model, config.device)
-    model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
+    model = MultiScalePredictor(loaded, config.test_sizes) if config.test_sizes else loaded
     scenes = open_scenes(config, model.config)
     evaluation = measure(config, model, scenes)
     if config.retrieval:
@@ -336,14 +338,14 @@ def run_photographs(config: EvaluateConfig) -> PhotographEvaluation:
 
 def _evaluate_photographs(config: EvaluateConfig, photographs: Path, folder: Path) -> PhotographEvaluation:
     loaded = load(config.model, config.device)
-    model = MultiScalePredictor(loaded, config.sizes) if config.sizes else loaded
+    model = MultiScalePredictor(loaded, config.test_sizes) if config.test_sizes else loaded
     peers = [OnnxPeer(path, model.config.categories) for path in config.peer]
     count = None if config.count == EvaluateConfig.count else config.count
     evaluation = evaluate_photographs(
         photographs,
         model,
         peers,
-        threshold=config.threshold,
+        threshold=config.score_threshold,
         batch=config.batch,
         count=count,
         part=config.part,
@@ -427,7 +429,12 @@ def _draw(
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line: parse the options, run, print the figures."""
-    config = tyro.cli(EvaluateConfig, args=args, prog="nolbo evaluate", description=__doc__)
+    config = tyro.cli(
+        EvaluateConfig,
+        args=current_arguments(EvaluateConfig, args),
+        prog="nolbo evaluate",
+        description=__doc__,
+    )
     if config.photographs is not None:
         text = photograph_table(run_photographs(config), config.model)
     else:

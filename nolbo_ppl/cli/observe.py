@@ -20,9 +20,11 @@ from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.files import atomic_path, write_jsonl
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.pipeline.perception import observe_images
+from nolbo_ppl.renamed_options import current_arguments, renamed_options
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 
+@renamed_options(threshold="score_threshold")
 @dataclass(frozen=True)
 class ObserveConfig:
     """What to observe and where to write."""
@@ -45,7 +47,7 @@ class ObserveConfig:
     """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
     camera: Path | None = None
     """A file with the camera instead (see `nolbo run --intrinsics`), whose distortion is taken out of the images."""
-    threshold: float = 0.3
+    score_threshold: float = 0.3
     """Least objectness of a detection."""
     pictures: bool = True
     """Draw the posterior over each image."""
@@ -113,7 +115,7 @@ def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel,
     observe = partial(
         model.observe,
         intrinsics=config.intrinsics,
-        threshold=config.threshold,
+        threshold=config.score_threshold,
         size=config.size,
         batch=config.batch,
         seed=config.seed,
@@ -137,7 +139,14 @@ def main(args: Sequence[str] | None = None) -> None:
     """Parse the command line and observe."""
     import tyro
 
-    summary = run(tyro.cli(ObserveConfig, args=args, prog="nolbo observe", description=__doc__))
+    summary = run(
+        tyro.cli(
+            ObserveConfig,
+            args=current_arguments(ObserveConfig, args),
+            prog="nolbo observe",
+            description=__doc__,
+        )
+    )
     sys.stdout.write(f"{summary.detections} objects in {summary.images} images: {summary.file}\n")
     if summary.guessed:
         sys.stdout.write(summary.guessed + "\n")

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-LEAST_PART = 0.25
+MIN_PART = 0.25
 """Least share of a picture's area that a random part has."""
 ASPECT = 4 / 3
 """Greatest ratio of the sides of a random part."""
@@ -18,7 +18,7 @@ def random_part(image: UInt8[np.ndarray, "h w 3"], size: int, rng: np.random.Gen
     """A part of random size, place and shape, turned left to right in half of the cases (C. Szegedy et al., 2015)."""
     height, width = image.shape[:2]
     for _ in range(10):
-        area = height * width * rng.uniform(LEAST_PART, 1.0)
+        area = height * width * rng.uniform(MIN_PART, 1.0)
         aspect = np.exp(rng.uniform(-np.log(ASPECT), np.log(ASPECT)))
         w, h = round(np.sqrt(area * aspect)), round(np.sqrt(area / aspect))
         if 0 < w <= width and 0 < h <= height:

@@ -148,12 +148,12 @@ class RunFolder:
         return self._poses("odometry.txt", "the odometry")
 
     @property
-    def odometry_covariance(self) -> Float[np.ndarray, "n-1 6 6"] | None:
+    def odometry_covariance(self) -> Float[np.ndarray, "s 6 6"] | None:
         """Covariance of every step of the odometry, [rotation rad, translation m]."""
         return covariance_beside(self.elsewhere.get("odometry.txt", self.path / "odometry.txt"))
 
     @cached_property
-    def odometry_flags(self) -> UInt8[np.ndarray, " n-1"] | None:
+    def odometry_flags(self) -> UInt8[np.ndarray, " s"] | None:
         """`StepFlag` bits of the steps of visual odometry; None where the odometry was given."""
         path = self.path / "odometry_covariance.npz"
         if "odometry.txt" in self.elsewhere or not path.is_file():
@@ -164,8 +164,8 @@ class RunFolder:
     def write_odometry(
         self,
         T_world_camera: Poses,
-        covariance: Float[np.ndarray, "n-1 6 6"] | None = None,
-        flags: UInt8[np.ndarray, " n-1"] | None = None,
+        covariance: Float[np.ndarray, "s 6 6"] | None = None,
+        flags: UInt8[np.ndarray, " s"] | None = None,
     ) -> None:
         """Write `odometry.txt` and, where it is known, `odometry_covariance.npz` with what its steps lacked (`StepFlag` bits)."""
         if covariance is not None:

@@ -22,7 +22,7 @@ from nolbo_ppl.io.trajectory_tables import TableFormat, parse_table
 
 TrajectoryFormat = Literal["kitti", "tum"]
 """What is written: TUM where there are times, KITTI where there are none."""
-Covariances = Float[np.ndarray, "n-1 6 6"]
+Covariances = Float[np.ndarray, "s 6 6"]
 COVARIANCE = "odometry_covariance.npz"
 """File of the covariances of an odometry's steps, beside it."""
 TIME_TOLERANCE = 0.02

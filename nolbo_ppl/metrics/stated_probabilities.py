@@ -19,7 +19,7 @@ from nolbo_ppl.metrics.calibration import BINS, expected_calibration_error
 
 LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
 """Levels of regions whose coverage is reported."""
-LEAST_IN_BIN = 50
+MIN_IN_BIN = 50
 """Bins of a reliability table with fewer cases are joined to the next."""
 LIMIT = 1e-6
 """Probabilities are kept this far from zero and one in a log score: one mistake at certainty costs 13.8 nats."""
@@ -62,7 +62,7 @@ def log_score(stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"])
 
 
 def reliability_bins(
-    stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"], bins: int = 10, least: int = LEAST_IN_BIN
+    stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"], bins: int = 10, least: int = MIN_IN_BIN
 ) -> tuple[ReliabilityBin, ...]:
     """Bins of equal width, those of fewer than `least` cases joined to the next; the last ones alone where they are all there is.
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-LEAST_SCALE = 0.05
+MIN_SCALE = 0.05
 """No category is known more sharply than this (of the log diagonal)."""
 
 
@@ -35,6 +35,6 @@ class CategorySizes(nn.Module):
     @torch.no_grad()
     def learn(self, label: int, log_diagonal: Float[Tensor, " n"]) -> None:
         """Take mean and spread of one category's log diagonals; of at least two."""
-        scale = float(log_diagonal.double().std().clamp_min(LEAST_SCALE))
+        scale = float(log_diagonal.double().std().clamp_min(MIN_SCALE))
         self.get_buffer("log_mean")[label] = float(log_diagonal.double().mean())
         self.get_buffer("precision")[label] = scale**-2

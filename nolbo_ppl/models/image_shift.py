@@ -12,7 +12,7 @@ AXES = 16
 """Principal axes of the features along which the spread of learnt images is known one by one."""
 RESIDUAL_WEIGHT = 10.0
 """Weight of what lies off these axes, in axes: there the features of noise, drawings and leaves differ most."""
-LEAST_SPREAD = 1e-3
+MIN_SPREAD = 1e-3
 """Least spread of a feature."""
 ODDS_PER_SHIFT = 6.0
 """Log odds of objectness that an image loses for each unit of shift beyond 1."""
@@ -76,7 +76,7 @@ class ImageShift(nn.Module):
         With few images there are fewer axes.
         """
         own, buffers = images.double(), dict(self.named_buffers())
-        mean, spread = own.mean(0), own.std(0).clamp_min(LEAST_SPREAD)
+        mean, spread = own.mean(0), own.std(0).clamp_min(MIN_SPREAD)
         z = (own - mean) / spread
         _, singular, directions = torch.linalg.svd(z, full_matrices=False)
         axes = min(buffers["axes"].shape[1], max(len(own) // 8, 1), len(singular))

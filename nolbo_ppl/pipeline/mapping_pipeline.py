@@ -33,6 +33,7 @@ from nolbo_ppl.pipeline.run_summary import summarise
 from nolbo_ppl.pipeline.stage_keys import STAGES, StageName, json_of, stage_settings
 from nolbo_ppl.pipeline.stage_store import PipelineStage, run_stages
 from nolbo_ppl.pipeline.thumbnails import best_views, write_thumbnails
+from nolbo_ppl.renamed_options import stored_names
 from nolbo_ppl.viz.map_plots import draw_slam_result
 
 LOG = logging.getLogger(__name__)
@@ -107,15 +108,15 @@ class ObjectMappingPipeline:
         """The guide on every keyframe."""
         config = self.config
         options: dict[str, Any] = {
-            "threshold": config.threshold,
-            "iou_threshold": config.overlap,
+            "threshold": config.score_threshold,
+            "iou_threshold": config.nms_iou_threshold,
             "decode": False,
             "batch": config.batch,
         }
-        if len(config.sizes) > 1:
-            ask = partial(MultiScalePredictor(self.model, config.sizes).observe, **options)
+        if len(config.test_sizes) > 1:
+            ask = partial(MultiScalePredictor(self.model, config.test_sizes).observe, **options)
         else:
-            ask = partial(self.model.observe, size=config.sizes[0], **options)
+            ask = partial(self.model.observe, size=config.test_sizes[0], **options)
         names, times = self.run.image_names, [row.get("time") for row in self.run.frames]
         seen = observe_sequence(
             ask, self.read, names, self.drive.intrinsics, self.depth_source(), config.batch, times, config.usual_heights
@@ -161,7 +162,7 @@ class ObjectMappingPipeline:
             drive=config.truth_objects,
             model=None if config.truth_objects is None else self.model,
             config=self.slam_config,
-            loop_gap=config.loop_gap,
+            loop_gap=config.min_loop_gap,
             seed=config.seed,
         )
         if objects is not None:
@@ -210,13 +211,20 @@ def run_pipeline(config: RunConfig) -> dict[str, Any]:
         >>> _ = (folder / "odometry.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {z}\\n" for z in range(3)))
         >>> config = nolbo_ppl.RunConfig(
         ...     folder / "images", folder / "run", intrinsics=folder / "camera.txt", odometry=folder / "odometry.txt",
-        ...     sizes=(96,), report=False)
+        ...     test_sizes=(96,), report=False)
         >>> summary = nolbo_ppl.run(config)
         >>> summary["frames"], summary["observations"], summary["landmarks"]
         (3, 0, 0)
     """
     mission = ObjectMappingPipeline(config)
-    run_stages(config.out, mission.stages(), json_of(config), library_versions(), mission.seconds, mission.cpu_seconds)
+    run_stages(
+        config.out,
+        mission.stages(),
+        stored_names(config, json_of(config)),
+        library_versions(),
+        mission.seconds,
+        mission.cpu_seconds,
+    )
     return read_json(config.out / "summary.json")
 
 
@@ -232,7 +240,12 @@ def check_folders(config: RunConfig) -> None:
         InputError: names the input.
     """
     out = config.out.resolve()
-    files = {"intrinsics": config.intrinsics, "odometry": config.odometry, "truth": config.truth, "wheel": config.wheel}
+    files = {
+        "intrinsics": config.intrinsics,
+        "odometry": config.odometry,
+        "truth": config.truth,
+        "step lengths": config.step_lengths,
+    }
     inputs = {"images": config.images, "truth-objects": config.truth_objects, "depth": config.depth, "right": config.right}
     inputs |= {name: None if path is None else path.parent for name, path in files.items()}
     for name, folder in inputs.items():

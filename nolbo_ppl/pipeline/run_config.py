@@ -12,8 +12,17 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.odometry import OdometryConfig
 from nolbo_ppl.pipeline.stage_keys import affects
+from nolbo_ppl.renamed_options import renamed_options
 
 
+@renamed_options(
+    every="frame_stride",
+    wheel="step_lengths",
+    sizes="test_sizes",
+    threshold="score_threshold",
+    overlap="nms_iou_threshold",
+    loop_gap="min_loop_gap",
+)
 @dataclass(frozen=True)
 class RunConfig:
     """From images to a corrected trajectory, a map of objects with shapes, figures and a report.
@@ -21,7 +30,7 @@ class RunConfig:
     Example:
         >>> import nolbo_ppl
         >>> config = nolbo_ppl.RunConfig("drive/images", "run", intrinsics="drive/intrinsics.json", camera_height=1.5)
-        >>> config.threshold
+        >>> config.score_threshold
         0.6
     """
 
@@ -54,20 +63,20 @@ class RunConfig:
     """Height of the camera over the ground, m: gives visual odometry its scale."""
     camera_pitch: float = field(default=0.0, metadata=affects("odometry"))
     """How far that camera looks down, rad."""
-    wheel: Path | None = field(default=None, metadata=affects("odometry", "file"))
+    step_lengths: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """Length of each step between images, m, a number a line: gives visual odometry its scale."""
-    every: int = field(default=1, metadata=affects("odometry"))
+    frame_stride: int = field(default=1, metadata=affects("odometry"))
     """Use every so many-th image."""
     keyframe_distance: float = field(default=0.0, metadata=affects("odometry"))
     """Of those, keep one this far from the last, m; with `keyframe_angle` 0 as well, all are kept."""
     keyframe_angle: float = field(default=0.0, metadata=affects("odometry"))
     """Or turned by this much, rad."""
-    sizes: tuple[int, ...] = field(default=(576,), metadata=affects("observe"))
+    test_sizes: tuple[int, ...] = field(default=(576,), metadata=affects("observe"))
     """Longer sides, px, at which the model looks at each image: one for pictures like those it was trained on, more where
     near objects are many times larger than far ones."""
-    threshold: float = field(default=0.6, metadata=affects("observe"))
+    score_threshold: float = field(default=0.6, metadata=affects("observe"))
     """Least objectness of a detection."""
-    overlap: float = field(default=0.2, metadata=affects("observe"))
+    nms_iou_threshold: float = field(default=0.2, metadata=affects("observe"))
     """Overlap (IoU) above which two regions of an image describe one object: the less certain one goes. Two regions on one
     object would be two landmarks; of two objects so close in one image another image shows the second."""
     batch: int = field(default=16, metadata=affects(None))
@@ -89,7 +98,7 @@ class RunConfig:
     """Also write trajectory and map as map.mcap, for Foxglove and rviz (extra `ros`)."""
     report: bool = field(default=True, metadata=affects(None))
     """Write report.html."""
-    loop_gap: int = field(default=50, metadata=affects("figures"))
+    min_loop_gap: int = field(default=50, metadata=affects("figures"))
     """Detections further apart than this many keyframes make a loop pair, in the figures."""
     seed: int = field(default=0, metadata=affects("figures"))
     """Seed of the samples of the landmarks' shapes, and of the views drawn for the figures."""
@@ -101,16 +110,16 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.scale_drift and not self.slam.scale_drift:
             object.__setattr__(self, "slam", dataclasses.replace(self.slam, scale_drift=True))
-        if self.every < 1:
-            raise input_error("--every", got=self.every, expected="at least 1")
-        if not 0 < self.threshold < 1:
-            raise input_error("--threshold", got=self.threshold, expected="a probability between 0 and 1")
-        if not 0 < self.overlap <= 1:
-            raise input_error("--overlap", got=self.overlap, expected="an overlap above 0, up to 1")
+        if self.frame_stride < 1:
+            raise input_error("--frame-stride", got=self.frame_stride, expected="at least 1")
+        if not 0 < self.score_threshold < 1:
+            raise input_error("--score-threshold", got=self.score_threshold, expected="a probability between 0 and 1")
+        if not 0 < self.nms_iou_threshold <= 1:
+            raise input_error("--nms-iou-threshold", got=self.nms_iou_threshold, expected="an overlap above 0, up to 1")
         if min(self.keyframe_distance, self.keyframe_angle) < 0:
             raise input_error("spacing of keyframes", got=(self.keyframe_distance, self.keyframe_angle), expected="0 or more")
-        if not self.sizes or min(self.sizes) < 32:
-            raise input_error("--sizes", got=self.sizes, expected="at least one, none under 32 px")
+        if not self.test_sizes or min(self.test_sizes) < 32:
+            raise input_error("--test-sizes", got=self.test_sizes, expected="at least one, none under 32 px")
         if self.batch < 1:
             raise input_error("--batch", got=self.batch, expected="at least 1")
         if self.depth is not None and self.right is not None:
@@ -121,5 +130,5 @@ class RunConfig:
             raise input_error("--baseline", got=self.baseline, expected="a distance in m")
         if not (np.isfinite(self.depth_unit) and self.depth_unit > 0):
             raise input_error("--depth-unit", got=self.depth_unit, expected="metres of one step, above 0")
-        if self.camera_height is not None and self.wheel is not None:
-            raise input_error("--camera-height and --wheel", got="both", expected="one source of lengths")
+        if self.camera_height is not None and self.step_lengths is not None:
+            raise input_error("--camera-height and --step-lengths", got="both", expected="one source of lengths")

@@ -135,7 +135,7 @@ def open_run_inputs(config: RunConfig) -> RunInputs:
         found = read_frame_poses(config.truth, len(frames), frames.times, interpolate=is_bag(config.truth), of="the images")
         truth = found.T_world_camera
         remarks += found.remarks()
-    return RunInputs(frames, camera, np.arange(0, len(frames), config.every), truth, tuple(remarks))
+    return RunInputs(frames, camera, np.arange(0, len(frames), config.frame_stride), truth, tuple(remarks))
 
 
 def depth_of_drive(drive: RunInputs, config: RunConfig, index: Sequence[int]) -> DepthSource:
@@ -152,17 +152,19 @@ def scale_of(drive: RunInputs, config: RunConfig) -> Scale:
     """
     if config.camera_height is not None:
         return GroundHeight(config.camera_height, pitch=config.camera_pitch)
-    if config.wheel is not None:
-        return KnownLengths(lengths_between(read_step_lengths(config.wheel, len(drive.frames) - 1), drive.used))
+    if config.step_lengths is not None:
+        return KnownLengths(lengths_between(read_step_lengths(config.step_lengths, len(drive.frames) - 1), drive.used))
     if config.depth is not None or config.right is not None or drive.frames.has_depth:
         return depth_noise(depth_of_drive(drive, config, drive.used.tolist()))
     if drive.truth is not None:
         if not np.isfinite(drive.truth[drive.used]).all():
-            raise input_error("lengths from a truth with gaps", expected="a pose for every image, --wheel or --camera-height")
+            raise input_error(
+                "lengths from a truth with gaps", expected="a pose for every image, --step-lengths or --camera-height"
+            )
         return KnownLengths(lengths_of(drive.truth[drive.used]))
     raise input_error(
         "visual odometry without a scale",
-        expected="--camera-height, --wheel, --depth, --right or --truth",
+        expected="--camera-height, --step-lengths, --depth, --right or --truth",
         do="or give an odometry of your own with --odometry",
     )
 

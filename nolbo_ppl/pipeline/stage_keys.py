@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.ros_bags import is_bag, split_topic
+from nolbo_ppl.renamed_options import stored_names
 
 StageName = Literal["odometry", "observe", "slam", "map", "crops", "figures", "report"]
 STAGES: tuple[StageName, ...] = ("odometry", "observe", "slam", "map", "crops", "figures", "report")
@@ -58,7 +59,7 @@ def stage_settings(config: Any, images: Callable[[], Any]) -> dict[StageName, di
         if stage is not None:
             value = plain[option.name] if content == "value" else digests[content](getattr(config, option.name))
             settings[stage][option.name] = value
-    return settings
+    return {stage: stored_names(config, values) for stage, values in settings.items()}
 
 
 def json_of(config: Any) -> dict[str, Any]:

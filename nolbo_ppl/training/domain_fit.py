@@ -21,13 +21,13 @@ from nolbo_ppl.synthetic.shapes import shape_from_seed
 
 HELD_OUT_EVERY = 4
 """One image of so many sets the scale of scores, and where photographs end and generated scenes begin."""
-LEAST_IMAGES = 40
+MIN_IMAGES = 40
 """Of fewer images of a kind nothing is learnt."""
 RIDGE = 0.03
 """Penalty on the squared weights of the classifier: with none it takes photographs of other cameras for generated scenes."""
 SHAPES = 24
 """Generated shapes of a category behind the spread of its sizes."""
-LEAST_SIZE_SPREAD = 0.12
+MIN_SIZE_SPREAD = 0.12
 """Least spread of log diagonals: families of one kind of chair are no measure of all chairs."""
 
 
@@ -42,7 +42,7 @@ def contexts_of(guide: HybridGuide, images: Iterable[UInt8[np.ndarray, "h w 3"]]
 
 
 def fit_domain(guide: HybridGuide, context: Float[Tensor, "n c"], generated: Bool[Tensor, " n"]) -> dict[str, float]:
-    """Fit classifier and shift scores; returns held-out figures. Nothing is fitted with fewer than `LEAST_IMAGES` of a kind.
+    """Fit classifier and shift scores; returns held-out figures. Nothing is fitted with fewer than `MIN_IMAGES` of a kind.
 
     Args:
         guide: receives them.
@@ -52,9 +52,9 @@ def fit_domain(guide: HybridGuide, context: Float[Tensor, "n c"], generated: Boo
     figures: dict[str, float] = {}
     held = torch.arange(len(context), device=context.device) % HELD_OUT_EVERY == 0
     for kind, chosen in enumerate((~generated, generated)):
-        if int(chosen.sum()) >= LEAST_IMAGES:
+        if int(chosen.sum()) >= MIN_IMAGES:
             guide.shift.learn(kind, context[chosen & ~held], context[chosen & held])
-    if min(int(generated.sum()), int((~generated).sum())) < LEAST_IMAGES:
+    if min(int(generated.sum()), int((~generated).sum())) < MIN_IMAGES:
         return figures
     _fit_classifier(guide, context[~held], generated[~held])
     with torch.no_grad():
@@ -108,7 +108,7 @@ def learn_sizes(guide: HybridGuide, categories: Sequence[str], seed: int) -> Non
     for label, name in enumerate(categories):
         if name not in TYPICAL_DIAGONAL:
             continue
-        spread = LEAST_SIZE_SPREAD
+        spread = MIN_SIZE_SPREAD
         try:
             own = np.log([shape_from_seed(name, seed + k).diagonal for k in range(SHAPES)])
             spread = max(spread, float(own.std()))

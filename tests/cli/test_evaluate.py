@@ -567,7 +567,9 @@ def test_the_verb_writes_figures_and_pictures(scene_folder, tmp_path, capsys):
     save(tmp_path / "model", model, Calibration(), {})
     out = tmp_path / "out"
     arguments = f"--model {tmp_path / 'model'} --scenes {scene_folder} --count 6 --out {out} --resamples 20"
-    evaluate.main([*arguments.split(), "--threshold", "0.002", "--retrieval", "--gallery", "2", "--sizes", "64", "128"])
+    evaluate.main(
+        [*arguments.split(), "--score-threshold", "0.002", "--retrieval", "--gallery", "2", "--test-sizes", "64", "128"]
+    )
     values = json.loads((out / "metrics.json").read_text())
     assert set(REQUIRED) <= set(values) and values["scenes"] == 6
     assert values["configuration"]["scenes"] == str(scene_folder) and values["seeds"]["scenes"] is None

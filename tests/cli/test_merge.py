@@ -26,7 +26,7 @@ from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_traject
 OPTIONS = ["--config.hypotheses", "1", "--config.odometry-rotation-scale", "0.003", "--config.odometry-translation-ratio", "0.01"]
 
 
-def write_drive(folder: Path, truth: np.ndarray, world: SimulatedWorld, rng: np.random.Generator) -> None:
+def write_sequence_folder(folder: Path, truth: np.ndarray, world: SimulatedWorld, rng: np.random.Generator) -> None:
     folder.mkdir()
     odometry = simulate_odometry(inverse(truth[0]) @ truth, rng, rotation_scale=0.003, translation_ratio=0.01)
     table, _ = simulate_detections(truth, world, DetectorConfig(), rng)
@@ -42,7 +42,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     circle = simulate_circuit(rng, laps=1, radius=18.0, frames_per_lap=50)
     here, there = (simulate_world(circle, WorldConfig(objects=22, categories=5, latent_dim=4), rng) for _ in range(2))
     for name, rows, world in (("a", slice(0, 32), here), ("b", slice(12, 44), here), ("c", slice(5, 35), there)):
-        write_drive(folder / name, circle[rows], world, rng)
+        write_sequence_folder(folder / name, circle[rows], world, rng)
     return folder, relative(circle[0], circle[12])
 
 

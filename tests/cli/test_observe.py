@@ -52,7 +52,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def observed(model: Path, images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("observed") / "deep" / "out"
-    summary = run(ObserveConfig(images, out, str(model), (60.0, 60.0, 32.0, 32.0), threshold=THRESHOLD, pictures=False))
+    summary = run(ObserveConfig(images, out, str(model), (60.0, 60.0, 32.0, 32.0), score_threshold=THRESHOLD, pictures=False))
     assert summary.images == 4
     assert summary.detections == sum(1 for _ in read_jsonl(summary.file)) > 4
     return out
@@ -96,7 +96,7 @@ def test_a_picture_an_image(model: Path, tmp_path: Path) -> None:
         Image.fromarray(np.full((64, 64, 3), 120, dtype=np.uint8)).save(tmp_path / "images" / name)
     answer = load(model).observe(open_image(tmp_path / "images" / "one.png"), threshold=1e-6, decode=False)
     best = float(np.sort(answer.objectness)[-2:].mean())  # one or two objects: drawing shapes takes its time
-    run(ObserveConfig(tmp_path / "images", tmp_path / "out", str(model), threshold=best))
+    run(ObserveConfig(tmp_path / "images", tmp_path / "out", str(model), score_threshold=best))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["observations.jsonl", "one.png", "two.png"]
     with Image.open(tmp_path / "out" / "one.png") as picture:
         assert picture.width > 1000
@@ -106,7 +106,7 @@ def test_without_pictures_and_intrinsics_by_the_command_line(
     model: Path, images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folders = ["--images", str(images), "--out", str(tmp_path), "--model", str(model)]
-    main([*folders, "--no-pictures", "--threshold", "0.999999"])
+    main([*folders, "--no-pictures", "--score-threshold", "0.999999"])
     assert "objects in 4 images" in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["observations.jsonl"]
 
@@ -114,7 +114,7 @@ def test_without_pictures_and_intrinsics_by_the_command_line(
 def test_nothing_found_is_an_empty_file(model: Path, tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     Image.fromarray(np.full((64, 64, 3), 90, dtype=np.uint8)).save(tmp_path / "images" / "grey.png")
-    summary = run(ObserveConfig(tmp_path / "images", tmp_path / "out", str(model), threshold=1 - 1e-12))
+    summary = run(ObserveConfig(tmp_path / "images", tmp_path / "out", str(model), score_threshold=1 - 1e-12))
     assert summary.detections == 0
     assert summary.file.read_text(encoding="utf-8") == ""
     assert (tmp_path / "out" / "grey.png").is_file()
@@ -124,7 +124,7 @@ def test_batches_do_not_change_the_answers(model: Path, images: Path, tmp_path: 
     lines = []
     for batch in (1, 3):
         out = tmp_path / str(batch)
-        run(ObserveConfig(images, out, str(model), threshold=THRESHOLD, pictures=False, batch=batch))
+        run(ObserveConfig(images, out, str(model), score_threshold=THRESHOLD, pictures=False, batch=batch))
         lines.append([row for _, row in read_jsonl(out / "observations.jsonl")])
     assert [row["id"] for row in lines[0]] == [row["id"] for row in lines[1]]
     for one, three in zip(*lines):
@@ -133,8 +133,8 @@ def test_batches_do_not_change_the_answers(model: Path, images: Path, tmp_path: 
 
 def test_a_larger_size_sees_other_cells(model: Path, images: Path, tmp_path: Path) -> None:
     """`--size` reaches the network: as many cells as a picture of that size has."""
-    config = ObserveConfig(images, tmp_path / "large", str(model), threshold=0.01, pictures=False, size=128)
-    small = ObserveConfig(images, tmp_path / "small", str(model), threshold=0.01, pictures=False)
+    config = ObserveConfig(images, tmp_path / "large", str(model), score_threshold=0.01, pictures=False, size=128)
+    small = ObserveConfig(images, tmp_path / "small", str(model), score_threshold=0.01, pictures=False)
     boxes = [[row["box"] for _, row in read_jsonl(run(one).file)] for one in (config, small)]
     assert boxes[0] != boxes[1]
     with pytest.raises(InputError, match="multiple of 32"):

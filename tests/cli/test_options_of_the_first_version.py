@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import warnings
+from pathlib import Path
 
 import pytest
+
+from nolbo_ppl.pipeline.run_config import RunConfig
+from nolbo_ppl.pipeline.stage_keys import stage_settings
+from nolbo_ppl.renamed_options import current_arguments, renamed_options, stored_names
 
 OPTIONS = {
     "cli.curves:CurvesConfig": """
@@ -75,6 +81,52 @@ OPTIONS = {
 @pytest.mark.parametrize("place", OPTIONS)
 def test_options_of_the_first_version_are_still_taken(place: str) -> None:
     module, name = place.split(":")
-    known = {field.name for field in dataclasses.fields(getattr(importlib.import_module(f"nolbo_ppl.{module}"), name))}
-    missing = set(OPTIONS[place].split()) - known
-    assert not missing, "keep the old name for a release, with a FutureWarning"
+    config = getattr(importlib.import_module(f"nolbo_ppl.{module}"), name)
+    known = {field.name for field in dataclasses.fields(config)}
+    renamed = getattr(config, "__renamed_options__", {})
+    assert set(renamed.values()) <= known and not renamed.keys() & known
+    missing = set(OPTIONS[place].split()) - known - renamed.keys()
+    assert not missing, "keep the old name for a release: `renamed_options`"
+    for old, new in renamed.items():
+        with pytest.warns(FutureWarning, match=f"`--{old}` is now `--{new.replace('_', '-')}`"):
+            assert current_arguments(config, [f"--{old}", "3"]) == [f"--{new.replace('_', '-')}", "3"]
+
+
+def test_a_run_takes_old_names_and_keeps_them_in_its_files(tmp_path: Path) -> None:
+    """Folders of 0.1.0 say `sizes` and `every`: stages that are done stay done."""
+    with pytest.warns(FutureWarning, match="RunConfig: `sizes` is now `test_sizes`"):
+        config = RunConfig(images=tmp_path, out=tmp_path / "out", sizes=(96,))  # type: ignore[call-arg]
+    assert config.test_sizes == (96,) and dataclasses.replace(config, frame_stride=2).test_sizes == (96,)
+    with pytest.warns(FutureWarning, match="`threshold` is now `score_threshold`"):
+        assert config.threshold == 0.6  # type: ignore[attr-defined]
+    settings = stage_settings(config, lambda: 1)
+    assert {"sizes", "threshold", "overlap"} <= settings["observe"].keys() and {"every", "wheel"} <= settings["odometry"].keys()
+    assert "loop_gap" in settings["figures"] and not {"test_sizes", "min_loop_gap"} & set().union(*settings.values())
+
+
+@renamed_options(gap="min_gap")
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    min_gap: int = 1
+
+
+@renamed_options(draw="pictures")
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    pictures: bool = True
+    inner: Inner = Inner()
+    other: Inner | None = None
+
+
+def test_nested_options_and_switches() -> None:
+    with pytest.warns(FutureWarning):
+        found = current_arguments(Outer, ["--no-draw", "--inner.gap=4", "--other.gap", "5", "--inner.min-gap", "6", "gap"])
+    assert found == ["--no-pictures", "--inner.min-gap=4", "--other.min-gap", "5", "--inner.min-gap", "6", "gap"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert current_arguments(Outer, found) == found
+        assert stored_names(Outer(), dataclasses.asdict(Outer(inner=Inner(3)))) == {
+            "draw": True,
+            "inner": {"gap": 3},
+            "other": None,
+        }

@@ -48,7 +48,7 @@ def config_of(drive: SimulatedDrive, out: Path, **change: Any) -> RunConfig:  # 
         "truth": folder / "truth.txt",
         "truth_objects": folder,
         "out": out,
-        "threshold": 0.05,
+        "score_threshold": 0.05,
         "report": False,
         **change,
     }
@@ -145,7 +145,7 @@ def test_a_finished_run_is_not_done_again(known: SimulatedDrive, finished: Path,
 def test_an_interruption_keeps_what_is_complete(known: SimulatedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "run"
     short = replace(config_of(known, out).slam, em_iterations=1)
-    config = config_of(known, out, truth_objects=None, every=2, online=True, slam=short)
+    config = config_of(known, out, truth_objects=None, frame_stride=2, online=True, slam=short)
     write = pipeline.write_thumbnails
 
     def interrupted(folder: Path, *arguments: Any) -> None:
@@ -186,7 +186,9 @@ def test_covariances_beside_an_odometry_come_with_it(known: SimulatedDrive, tmp_
     write_trajectory(tmp_path / "mine" / "odometry.txt", Trajectory(T))
     one = np.diag([1e-6, 2e-6, 3e-6, 1e-4, 2e-4, 3e-4])
     np.savez(tmp_path / "mine" / "odometry_covariance.npz", covariance=np.tile(one, (119, 1, 1)))
-    mission = ObjectMappingPipeline(config_of(known, tmp_path / "run", odometry=tmp_path / "mine" / "odometry.txt", every=2))
+    mission = ObjectMappingPipeline(
+        config_of(known, tmp_path / "run", odometry=tmp_path / "mine" / "odometry.txt", frame_stride=2)
+    )
     (tmp_path / "run").mkdir()
     mission.odometry()
     with np.load(tmp_path / "run" / "odometry_covariance.npz") as arrays:
@@ -227,15 +229,15 @@ def test_results_never_replace_the_input(known: SimulatedDrive) -> None:
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"every": 0}, "--every"),
-        ({"threshold": 1.0}, "--threshold"),
-        ({"sizes": ()}, "--sizes"),
+        ({"frame_stride": 0}, "--frame-stride"),
+        ({"score_threshold": 1.0}, "--score-threshold"),
+        ({"test_sizes": ()}, "--test-sizes"),
         ({"batch": 0}, "--batch"),
         ({"right": Path("right")}, "a stereo pair"),
         ({"keyframe_distance": -1.0}, "spacing of keyframes"),
         ({"depth": Path("d"), "right": Path("r"), "baseline": 0.1}, "--depth and --right"),
         ({"right": Path("r"), "baseline": -0.1}, "--baseline"),
-        ({"camera_height": 1.0, "wheel": Path("w")}, "one source of"),
+        ({"camera_height": 1.0, "step_lengths": Path("w")}, "one source of"),
     ],
 )
 def test_options_that_make_no_sense(change: dict[str, Any], match: str) -> None:
@@ -259,9 +261,9 @@ def test_the_whole_way_with_a_network(drive: SimulatedDrive, tmp_path: Path, cap
             str(tmp_path / "model"),
             "--out",
             str(tmp_path / "run"),
-            "--every",
+            "--frame-stride",
             "12",
-            "--sizes",
+            "--test-sizes",
             "64",
             "--slam.em-iterations",
             "1",

@@ -31,13 +31,13 @@ def test_where_lengths_come_from(drive: SimulatedDrive, tmp_path: Path) -> None:
             "images": folder / "images",
             "intrinsics": folder / "intrinsics.json",
             "out": tmp_path / "run",
-            "every": 3,
+            "frame_stride": 3,
             **change,
         }
         config = RunConfig(**values)
         return scale_of(open_run_inputs(config), config)
 
-    by_wheel = scale(wheel=tmp_path / "wheel.txt", truth=folder / "truth.txt")
+    by_wheel = scale(step_lengths=tmp_path / "wheel.txt", truth=folder / "truth.txt")
     assert isinstance(by_wheel, KnownLengths)
     np.testing.assert_allclose(by_wheel.lengths[:2], [3 * 0.51, 3 * 0.54])  # three steps each
     by_truth = scale(truth=folder / "truth.txt")
@@ -45,7 +45,7 @@ def test_where_lengths_come_from(drive: SimulatedDrive, tmp_path: Path) -> None:
     np.testing.assert_allclose(by_truth.lengths, np.linalg.norm(np.diff(position, axis=0), axis=1), atol=1e-9)
     assert scale(camera_height=1.6, camera_pitch=0.1) == GroundHeight(1.6, pitch=0.1)
     with pytest.raises(InputError, match="lengths of steps: got 1 numbers, expected 119"):
-        scale(wheel=tmp_path / "short.txt")
+        scale(step_lengths=tmp_path / "short.txt")
 
 
 def test_lengths_of_steps_that_are_left_out_add_up() -> None:

@@ -25,7 +25,7 @@ def prints(config: RunConfig, images: Any = 1) -> dict[str, str]:
 
 @pytest.fixture
 def config(tmp_path: Path) -> RunConfig:
-    for name in ("intrinsics", "odometry", "truth", "wheel"):
+    for name in ("intrinsics", "odometry", "truth", "step_lengths"):
         (tmp_path / name).write_text(name)
     for name in ("depth", "right", "drive", "model"):
         (tmp_path / name).mkdir()
@@ -39,14 +39,14 @@ def changed(name: str, folder: Path) -> dict[str, Any]:
     special: dict[str, dict[str, Any]] = {
         "baseline": {"baseline": 0.3, "right": folder / "right"},
         "camera_height": {"camera_height": 1.5},
-        "sizes": {"sizes": (576, 864)},
+        "test_sizes": {"test_sizes": (576, 864)},
         "slam": {"slam": dataclasses.replace(SlamConfig(), seed=7)},
         "visual": {"visual": dataclasses.replace(OdometryConfig(), seed=7)},
         "images": {},
         "truth_objects": {"truth_objects": folder / "drive"},
         "right": {"right": folder / "right", "baseline": 0.3},
     }
-    files = {key: {key: folder / key} for key in ("odometry", "truth", "wheel", "depth", "model", "out")}
+    files = {key: {key: folder / key} for key in ("odometry", "truth", "step_lengths", "depth", "model", "out")}
     files["model"] = {"model": str(folder / "model")}
     files["intrinsics"] = {"intrinsics": folder / "truth"}
     default = OPTIONS[name].default
@@ -69,7 +69,7 @@ def test_an_option_changes_its_stage_and_those_after_it(name: str, config: RunCo
     ("option", "file", "stage"),
     [
         ("odometry", "odometry", "odometry"),
-        ("depth", "depth/new.png", "observe"),
+        ("depth", "depth/new.png", "odometry"),
         ("model", "model/model.safetensors", "observe"),
         ("truth_objects", "drive/objects.json", "figures"),
     ],

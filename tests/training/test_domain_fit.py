@@ -11,7 +11,7 @@ import torch
 from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
-from nolbo_ppl.training.domain_fit import LEAST_SIZE_SPREAD, contexts_of, fit_domain, learn_sizes
+from nolbo_ppl.training.domain_fit import MIN_SIZE_SPREAD, contexts_of, fit_domain, learn_sizes
 from tests.factories import tiny_config
 
 
@@ -57,4 +57,4 @@ def test_sizes_are_a_common_specimens() -> None:
     mean, precision = guide.sizes(torch.tensor([0, 1, 2]))
     assert float(mean[0]) == pytest.approx(math.log(TYPICAL_DIAGONAL["car"]))
     assert float(precision[1]) == 0.0
-    assert all(float(precision[k]) <= 1.0001 / LEAST_SIZE_SPREAD**2 for k in (0, 2))
+    assert all(float(precision[k]) <= 1.0001 / MIN_SIZE_SPREAD**2 for k in (0, 2))
