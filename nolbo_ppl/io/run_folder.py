@@ -21,6 +21,7 @@ from nolbo_ppl.geometry.alignment import align, principal_plane
 from nolbo_ppl.io.camera_files import CameraIntrinsics, write_camera
 from nolbo_ppl.io.fields import number_array
 from nolbo_ppl.io.files import inside, read_json, read_json_object, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.io.landmark_views import LandmarkViews, read_views
 from nolbo_ppl.io.landmarks import (
     Iterations,
     Voxels,
@@ -275,6 +276,11 @@ class RunFolder:
         """Best picture of a landmark; None when there is none (or the name would lead out of the folder)."""
         path = inside(self.path, f"crops/{name}.png")
         return path if path is not None and path.parent == self.crops and path.is_file() else None
+
+    @cached_property
+    def views(self) -> dict[str, LandmarkViews]:
+        """Pictures of the views of each landmark; none where nobody cut them out."""
+        return read_views(self.crops)
 
     @property
     def mesh(self) -> Path:

@@ -32,7 +32,7 @@ from nolbo_ppl.pipeline.run_inputs import RunInputs, depth_of_drive, estimate_or
 from nolbo_ppl.pipeline.run_summary import summarise
 from nolbo_ppl.pipeline.stage_keys import STAGES, StageName, json_of, stage_settings
 from nolbo_ppl.pipeline.stage_store import PipelineStage, run_stages
-from nolbo_ppl.pipeline.thumbnails import best_views, write_thumbnails
+from nolbo_ppl.pipeline.thumbnails import all_views, write_thumbnails
 from nolbo_ppl.renamed_options import stored_names
 from nolbo_ppl.viz.map_plots import draw_slam_result
 
@@ -146,10 +146,10 @@ class ObjectMappingPipeline:
             write_map_mcap(self.out / MCAP, Trajectory(run.estimate, known), run.landmarks, run.odometry)
 
     def crops(self) -> None:
-        """The best picture of each landmark."""
+        """The best picture of each landmark, and its views."""
         seen, found = self.run.detections, self.run.associations
         assert seen is not None and found is not None
-        write_thumbnails(self.run.crops, best_views(seen, found, [landmark.name for landmark in self.run.landmarks]), self.read)
+        write_thumbnails(self.run.crops, all_views(seen, found, [landmark.name for landmark in self.run.landmarks]), self.read)
 
     def figures(self) -> None:
         """summary.json, and whose each observation is where the truth tells."""

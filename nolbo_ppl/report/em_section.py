@@ -74,14 +74,11 @@ def em_slider(run: RunFolder) -> str:
             said.append(f"{len(points)} landmarks")
         dots = " ".join(f"M{number(u)} {number(v)}h0" for u, v in zip(axes.px(points[:, 0]), axes.py(points[:, 1])))
         data.append({"way": axes.points(way[rows]), "dots": dots, "say": " · ".join(said)})
-    moving = axes.clip([element("path", d=data[-1]["dots"], class_="dots", data_em="dots")])
+    moving = element("path", d=data[-1]["dots"], class_="dots", data_em="dots")
     moving += element("polyline", points=data[-1]["way"], class_="line estimate", data_em="way")
     first = axes.line(every[0], class_="line odometry faint")
-    plot = picture(
-        axes,
-        [axes.frame(axis_label(run, 0), axis_label(run, 1)), first, path_lines(run, axes, ("truth",)), moving],
-        "Trajectory and landmarks at an iteration of EM",
-    )
+    parts = [first, path_lines(run, axes, ("truth",)), moving]
+    plot = chart(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Trajectory and landmarks at an iteration of EM")
     last = len(iterations) - 1
     controls = element("button", "Play", type="button", data_em="play")
     controls += element("input", type="range", min=0, max=last, value=last, step=1, aria_label="Iteration", data_em="slider")

@@ -17,6 +17,10 @@ from nolbo_ppl.viz.style import MUTED, category_colour
 
 MOST_CARDS = 300
 """Landmarks shown, the best seen ones first: the page stays under some ten megabytes."""
+VIEW = 128
+"""Longer side of a view, px."""
+WHOLE = 0.995
+"""A view with at least this weight is the landmark's without a word."""
 MOST_BARS = 4
 """Categories of a posterior that are shown."""
 
@@ -49,6 +53,26 @@ def pictures(run: RunFolder, landmark: Landmark) -> str:
     elif run.voxel_names:
         out += _image("", "", "decoded shape", "no shape")
     return element("div", out, class_="pictures") if out else ""
+
+
+def all_views(run: RunFolder, landmark: Landmark) -> str:
+    """The pictures of a landmark's views, folded; empty without any. A click on the landmark in a map shows them as well."""
+    found = run.views.get(landmark.name)
+    if found is None or not found.pictures:
+        return ""
+    shown = ""
+    for view in found.pictures:
+        try:
+            uri = photo_uri(Image.fromarray(open_image(view.file, shorter_side=VIEW)), VIEW)
+        except InputError:
+            continue
+        caption = f"frame {view.frame}" + ("" if view.weight >= WHOLE else f", weight {view.weight:.2f}")
+        picture = f'<img src="{uri}" alt="{escape(f"{landmark.name} in frame {view.frame}")}" loading="lazy">'
+        shown += element("figure", picture + element("figcaption", escape(caption)))
+    told = f"{len(found.pictures)} of {found.count} views" if len(found.pictures) < found.count else f"all {found.count} views"
+    return (
+        element("details", element("summary", told) + element("div", shown, class_="view-grid"), class_="views") if shown else ""
+    )
 
 
 def posterior_bars(run: RunFolder, landmark: Landmark) -> str:
@@ -90,9 +114,14 @@ def card(run: RunFolder, k: int) -> str:
     landmark = run.landmarks[k]
     dot = element("span", "", class_="swatch", style=f"background:{colour_of(run, landmark)}")
     name = element("b", escape(landmark.name)) + (f" {escape(landmark.category)}" if landmark.category else "")
+    body = pictures(run, landmark) + posterior_bars(run, landmark) + facts(landmark) + all_views(run, landmark)
     return element(
         "article",
-        element("h3", dot + element("span", name)) + pictures(run, landmark) + posterior_bars(run, landmark) + facts(landmark),
+        element("h3", dot + element("span", name))
+        + pictures(run, landmark)
+        + posterior_bars(run, landmark)
+        + facts(landmark)
+        + all_views(run, landmark),
         id=f"card-{k}",
         class_="card",
         data_detections=float(np.nan_to_num(landmark.detections)),

@@ -16,6 +16,21 @@ ASSETS = Path(__file__).parent / "assets"
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 """The browser itself refuses every address."""
 
+VIEWS = element(
+    "dialog",
+    element("div", "", class_="sheet")
+    + element(
+        "form",
+        element("button", "To its card", value="card", data_to_card="")
+        + element("button", "Close", value="close", data_close=""),
+        method="dialog",
+        class_="foot",
+    ),
+    id="views",
+    aria_label="Views of a landmark",
+)
+"""Where all the views of a landmark are shown."""
+
 
 def build_page(run: RunFolder, title: str | None = None) -> str:
     """The report as HTML."""
@@ -47,6 +62,7 @@ def build_page(run: RunFolder, title: str | None = None) -> str:
             element("nav", "".join(links) + switch),
             element("main", header + "".join(parts) + frame_note),
             element("div", "", id="tip", role="status", hidden="hidden"),
+            VIEWS,
             f"<script>{script}</script>",
             "</body>",
             "</html>",

@@ -11,7 +11,7 @@ from nolbo_ppl.geometry.pose import relative, rotation_angle
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import align
 from nolbo_ppl.report.loop_section import Loop, is_right
-from nolbo_ppl.report.svg import CHI2_95, Axes, element, equal_axes, group, number, picture
+from nolbo_ppl.report.svg import CHI2_95, Axes, chart, element, equal_axes, group, number, picture
 from nolbo_ppl.report.wording import say
 from nolbo_ppl.structures.landmark import Landmark
 from nolbo_ppl.viz.style import MUTED, category_colour
@@ -91,12 +91,8 @@ def trajectory_plot(run: RunFolder) -> str:
     """Before, after and truth from above."""
     axes = map_axes(run, landmarks=False)
     xy = above(run, run.estimate[:, :3, 3])
-    parts = [
-        axes.frame(axis_label(run, 0), axis_label(run, 1)),
-        path_lines(run, axes, [name for name, _ in LINES]),
-        _ends(axes, xy),
-    ]
-    return picture(axes, parts, "Trajectories from above")
+    parts = [path_lines(run, axes, [name for name, _ in LINES]), _ends(axes, xy)]
+    return chart(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Trajectories from above")
 
 
 def landmark_tip(landmark: Landmark) -> str:
@@ -143,7 +139,7 @@ def landmark_marks(run: RunFolder, axes: Axes, ellipses: bool = True) -> str:
         parts.append(
             group([mark], data_tip=landmark_tip(landmark), data_card=k, data_layer=f"category-{category_number(run, landmark)}")
         )
-    return axes.clip(parts)
+    return "".join(parts)
 
 
 def category_number(run: RunFolder, landmark: Landmark) -> int:
@@ -154,12 +150,8 @@ def category_number(run: RunFolder, landmark: Landmark) -> int:
 def map_plot(run: RunFolder) -> str:
     """The map from above."""
     axes = map_axes(run)
-    parts = [
-        axes.frame(axis_label(run, 0), axis_label(run, 1)),
-        path_lines(run, axes, ("truth", "estimate")),
-        landmark_marks(run, axes),
-    ]
-    return picture(axes, parts, "Map from above")
+    parts = [path_lines(run, axes, ("truth", "estimate")), landmark_marks(run, axes)]
+    return chart(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Map from above")
 
 
 def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
@@ -177,9 +169,8 @@ def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
         style = f"stroke:{colour_of(run, landmark)}" if right is None else None
         tip += f"\n{kind}" if kind else ""
         parts.append(group([axes.line(corner, class_=f"loop {kind}", style=style, data_tip=tip)], data_layer=kind or "loops"))
-    frame = axes.frame(axis_label(run, 0), axis_label(run, 1))
-    drawn = [frame, path_lines(run, axes, ("estimate",)), axes.clip(parts), landmark_marks(run, axes, ellipses=False)]
-    return picture(axes, drawn, "Loop closures")
+    drawn = [path_lines(run, axes, ("estimate",)), *parts, landmark_marks(run, axes, ellipses=False)]
+    return chart(axes, (axis_label(run, 0), axis_label(run, 1)), drawn, "Loop closures")
 
 
 def clock(run: RunFolder) -> tuple[Float[np.ndarray, " n"], str]:

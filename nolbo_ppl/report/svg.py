@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ def escape(value: object) -> str:
 
 
 def number(value: float) -> str:
-    """A coordinate in px with one decimal."""
-    return f"{value:.1f}".rstrip("0").rstrip(".") if value else "0"
+    """A coordinate in px with two decimals: maps are looked at a hundred times as large."""
+    return f"{value:.2f}".rstrip("0").rstrip(".") if abs(value) >= 0.005 else "0"
 
 
 def element(tag: str, content: str | None = None, /, **attributes: object) -> str:
@@ -165,3 +166,17 @@ def picture(axes: Axes, parts: Iterable[str], label: str, **attributes: object) 
         aria_label=label,
         **attributes,
     )
+
+
+def chart(axes: Axes, labels: tuple[str, str], parts: Iterable[str], label: str) -> str:
+    """A map that the page's script zooms and moves: axes that are drawn anew, and a scene inside of them.
+
+    Without the script it is the same picture at rest.
+    """
+    stated = {
+        "x": [round(value, 9) for value in axes.x],
+        "y": [round(value, 9) for value in axes.y],
+        "box": [axes.left, axes.top, axes.width - axes.right, axes.height - axes.bottom],
+    }
+    scene = axes.clip([group(parts, class_="scene")])
+    return picture(axes, [axes.frame(*labels), scene], label, data_zoom=json.dumps(stated))

@@ -78,24 +78,45 @@ def draw_azimuth(axes: Axes, observations: ObjectPosteriors, index: int, colour:
     axes.set_title(f"azimuth {math.degrees(observations.viewpoint[index, 0]):.0f}°")
 
 
-def draw_position(axes: Axes, observations: ObjectPosteriors, index: int, colour: str) -> None:
-    """Density of the distance, with the position and its scales in words."""
-    position, covariance = observations.position[index], observations.position_covariance[index]
+def distance_density(
+    position: Float[np.ndarray, " 3"], covariance: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+    """Distances, m, the density of the distance there, 1/m, and the scale of its logarithm.
+
+    The guide states a normal density of the logarithm of the distance; the covariance of the position holds its scale to first
+    order (`position_covariance`). A normal density of the distance itself would reach behind the camera.
+
+    >>> x, density, scale = distance_density(np.array([0.0, 0.0, 5.0]), np.diag([0.01, 0.01, 9.0]))
+    >>> bool(x.min() > 0), round(float(np.sum((density[1:] + density[:-1]) / 2 * np.diff(x))), 2), round(scale, 2)
+    (True, 1.0, 0.6)
+    """
     distance = float(np.linalg.norm(position))
     ray = position / distance
-    scale = math.sqrt(float(ray @ covariance @ ray))
-    x = distance + scale * np.linspace(-3.5, 3.5, 141)
-    density = np.exp(-0.5 * ((x - distance) / scale) ** 2)
-    middle = np.abs(x - distance) <= 1.6448536 * scale
+    scale = math.sqrt(float(ray @ covariance @ ray)) / distance
+    x = distance * np.exp(scale * np.linspace(-3.3, 3.3, 241))
+    density = np.exp(-0.5 * (np.log(x / distance) / scale) ** 2) / (x * scale * math.sqrt(2 * math.pi))
+    return x, density, scale
+
+
+def draw_position(axes: Axes, observations: ObjectPosteriors, index: int, colour: str) -> None:
+    """Density of the distance (log-normal) with its central 90 %, and the position and its scales in words."""
+    position, covariance = observations.position[index], observations.position_covariance[index]
+    x, density, log_scale = distance_density(position, covariance)
+    density = density / density.max()
+    distance = float(np.linalg.norm(position))
+    low, high = (distance * math.exp(side * 1.6448536 * log_scale) for side in (-1, 1))
+    middle = (x >= low) & (x <= high)
     axes.fill_between(x[middle], 0, density[middle], color=colour, alpha=0.45, linewidth=0)
     axes.plot(x, density, color=colour, linewidth=1.2)
     across = np.sqrt(np.diag(covariance))
     words = "\n".join(f"{name} {_uncertain(p, s)}" for name, p, s in zip("xyz", position, across))
-    axes.text(0.02, 0.98, words, transform=axes.transAxes, va="top", fontsize=6.2, linespacing=1.25)
-    axes.set(xlim=(distance - 7.5 * scale, distance + 4 * scale), ylim=(0, 1.12), yticks=[])
+    axes.text(0.98, 0.98, words, transform=axes.transAxes, va="top", ha="right", fontsize=6.2, linespacing=1.25)
+    width = x[-1] - x[0]
+    axes.set(xlim=(max(0.0, x[0] - 0.03 * width), x[-1] + 0.55 * width), ylim=(0, 1.12), yticks=[])
     axes.spines["left"].set_visible(False)
     axes.locator_params(axis="x", nbins=4)
-    axes.set_title(f"distance {_uncertain(distance, scale)} m")
+    digits = max(0, min(4, 1 - math.floor(math.log10(max(distance * log_scale, 1e-9)))))
+    axes.set_title(f"distance {distance:.{digits}f} m ({low:.{digits}f} to {high:.{digits}f})")
 
 
 def _uncertain(value: float, scale: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ from PIL import Image
 
 from nolbo_ppl.geometry.pose import make_pose, matrix_to_quaternion, so3_exp
 from nolbo_ppl.io.landmarks import parse_landmark
+from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.pipeline.map_mesh import build_scene, landmark_mesh, write_glb
-from nolbo_ppl.pipeline.thumbnails import LONGEST, best_views, cut, write_thumbnails
+from nolbo_ppl.pipeline.thumbnails import LONGEST, Crop, all_views, best_views, cut, spread_views, write_thumbnails
 from nolbo_ppl.structures.association_table import AssociationTable
 from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.landmark import Landmark
@@ -89,12 +91,33 @@ def test_best_views_weigh_probability_objectness_and_size(tmp_path: Path) -> Non
         read.append(k)
         return np.full((48, 64, 3), 10 * k, dtype=np.uint8)
 
-    write_thumbnails(tmp_path / "crops", {**views, "L2": views["L1"]}, image)
-    assert read == [1, 2]  # each image once
-    assert sorted(path.name for path in (tmp_path / "crops").iterdir()) == ["L0.png", "L1.png", "L2.png"]
+    every = all_views(seen, found, ["L0", "L1"])
+    assert [(view.frame, view.weight) for view in every["L0"]] == [(0, 1.0), (1, 1.0), (2, 0.1)]
+    write_thumbnails(tmp_path / "crops", {**every, "L2": every["L1"]}, image)
+    assert read == [0, 1, 2]  # each image once
+    names = sorted(path.name for path in (tmp_path / "crops").iterdir())
+    assert names == ["L0.png", "L1.png", "L2.png", "views", "views.json"]
     assert int(np.asarray(Image.open(tmp_path / "crops" / "L0.png")).mean()) == 10
+    kept = RunFolder(tmp_path).views
+    assert {name: (seen.count, [view.frame for view in seen.pictures]) for name, seen in kept.items()} == {
+        "L0": (3, [0, 1, 2]),
+        "L1": (1, [2]),
+        "L2": (1, [2]),
+    }
+    assert int(np.asarray(Image.open(kept["L0"].pictures[2].file)).mean()) == 20
+    listed = json.loads((tmp_path / "crops" / "views.json").read_text())
+    listed["L1"]["views"][0]["file"] = "../L1.png"  # a list from anywhere opens nothing outside of the views
+    (tmp_path / "crops" / "views.json").write_text(json.dumps(listed | {"L9": 3, "L8": {"count": 1, "views": [7]}}))
+    assert {name: len(seen.pictures) for name, seen in RunFolder(tmp_path).views.items()} == {"L0": 3, "L1": 0, "L2": 1, "L8": 0}
     write_thumbnails(tmp_path / "none", {}, image)
-    assert list((tmp_path / "none").iterdir()) == []
+    assert sorted(path.name for path in (tmp_path / "none").iterdir()) == ["views", "views.json"]
+
+
+def test_views_are_spread_over_the_time_a_landmark_was_seen() -> None:
+    views = [Crop(k, np.zeros(4), value=float(k % 5)) for k in range(50)]
+    kept = spread_views(views, 10)
+    assert [view.frame for view in kept] == list(range(4, 50, 5))  # the best of each stretch
+    assert spread_views(views[:7], 10) == views[:7]
 
 
 def test_a_crop_shows_the_box_with_a_margin() -> None:

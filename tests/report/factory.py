@@ -95,6 +95,14 @@ def make_run(folder: Path) -> Path:
     for k, row in enumerate(landmarks):
         pixels = np.clip(np.linspace(60, 220, 64)[:, None, None] * np.array([1.0, 0.4 + 0.1 * (k % 5), 0.5]), 0, 255)
         Image.fromarray(np.tile(pixels, (1, 80, 1)).astype(np.uint8)).save(folder / "crops" / f"{row['name']}.png")
+    (folder / "crops" / "views").mkdir()
+    listed = {}
+    for k, row in enumerate(landmarks[:-1]):  # nobody cut the views of the last one out
+        for t in range(3):
+            Image.new("RGB", (64, 40), (40 * t, 30 * (k % 6), 90)).save(folder / "crops" / "views" / f"{k}-{t}.jpg")
+        rows = [{"frame": 2 * t, "file": f"{k}-{t}.jpg", "weight": 0.5 if t == 1 else 1.0, "objectness": 0.9} for t in range(3)]
+        listed[row["name"]] = {"count": 7 if k == 0 else 3, "views": rows}
+    write_json(folder / "crops" / "views.json", listed)
     shapes = {row["name"]: blob((0.2, 0.4, 0.16 + 0.02 * (k % 3))) for k, row in enumerate(landmarks[:-1])}
     write_voxels(folder / "slam" / "landmarks_voxels.npz", {name: (mean, mean * (1 - mean) / 2) for name, mean in shapes.items()})
     write_jsonl(

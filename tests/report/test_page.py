@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.report import build_page, read_run, write_report
+from nolbo_ppl.report import page as page_module
 from nolbo_ppl.report.sections import SECTIONS
 from tests.report.browser import Browser
 from tests.report.factory import FRAMES, drive
@@ -31,6 +33,28 @@ def page(report: Path, browser: Browser) -> Browser:
     browser.open(report.as_uri())
     browser.until("document.documentElement.dataset.ready === 'yes'")
     return browser
+
+
+def test_the_script_parses() -> None:
+    """Where there is no browser, node at least reads it; without either, its brackets are counted outside of texts."""
+    script = Path(page_module.ASSETS / "report.js")
+    node = shutil.which("node")
+    if node is not None:
+        done = subprocess.run([node, "--check", str(script)], capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr
+    plain = re.sub(r"`[^`]*`|\"[^\"\n]*\"|'[^'\n]*'|//[^\n]*", "", script.read_text(encoding="utf-8"))
+    for opening, closing in ("()", "[]", "{}"):
+        assert plain.count(opening) == plain.count(closing)
+
+
+def test_the_page_holds_what_the_script_needs(run_folder: Path) -> None:
+    """Without a browser: maps with their axes, views with their pictures, nothing that is loaded from elsewhere."""
+    html = build_page(read_run(run_folder))
+    stated = [json.loads(text.replace("&quot;", '"')) for text in re.findall(r'data-zoom="([^"]*)"', html)]
+    assert len(stated) == len(MAPS) and all(a["x"][0] < a["x"][1] and a["box"][0] < a["box"][2] for a in stated)
+    assert html.count('class="scene"') == len(MAPS) and html.count("data-to-card") == 2  # the button and the script
+    assert html.count('class="views"') == len(read_run(run_folder).landmarks) - 1
+    assert not re.search(r"(src|href)=\"(?!data:|#)", html)
 
 
 def test_the_browser_tells_script_errors(browser: Browser, tmp_path: Path) -> None:
@@ -101,6 +125,78 @@ def test_pointing_at_things_tells_about_them(page: Browser) -> None:
     assert re.match(r"L\d+ – \w+.*\nexistence 1.000", page.run("document.getElementById('tip').innerText"))
     page.run("document.querySelector('#map [data-card=\"3\"]').dispatchEvent(new MouseEvent('click', {bubbles: true}))")
     assert page.run("document.querySelector('.card.lit').id") == "card-3"
+    page.run("document.getElementById('views').close()")
+
+
+def test_a_click_on_a_landmark_shows_all_its_views(page: Browser, run_folder: Path) -> None:
+    first = read_run(run_folder).landmarks[0].name
+    page.run("document.querySelector('#map [data-card=\"0\"]').dispatchEvent(new MouseEvent('click', {bubbles: true}))")
+    assert page.run("document.getElementById('views').open")
+    assert page.run("document.querySelector('#views h3').innerText").startswith(first)
+    captions = page.run("[...document.querySelectorAll('#views figcaption')].map(x => x.textContent)")
+    assert captions == ["frame 0", "frame 2, weight 0.50", "frame 4"]
+    assert page.run("document.querySelector('#views summary').textContent") == "3 of 7 views"
+    assert page.run("[...document.querySelectorAll('#views img')].every(x => x.src.startsWith('data:image/jpeg'))")
+    page.run("document.querySelector('#views [data-close]').click()")
+    assert not page.run("document.getElementById('views').open")
+    # Without views, the card is what there is.
+    last = len(read_run(run_folder).landmarks) - 1
+    page.run(f"document.querySelector('#map [data-card=\"{last}\"]').dispatchEvent(new MouseEvent('click', {{bubbles: true}}))")
+    assert not page.run("document.getElementById('views').open")
+    assert page.run("document.querySelector('.card.lit').id") == f"card-{last}"
+
+
+MAPS = ("trajectory", "map", "loops", "em")
+
+
+@pytest.mark.parametrize("section", MAPS)
+def test_maps_zoom_and_move_with_their_axes(page: Browser, section: str) -> None:
+    """A place of the map keeps its coordinates: what the axes say of a landmark or a line is the same at any zoom."""
+    script = f"""(() => {{
+      const map = document.querySelector('#{section} svg[data-zoom]'), scene = map.querySelector('.scene');
+      const line = scene.querySelector('polyline').points[0], state = JSON.parse(map.dataset.zoom);
+      const at = new DOMPoint(line.x, line.y).matrixTransform(scene.transform.baseVal.consolidate()?.matrix || new DOMMatrix());
+      const ticks = [...map.querySelectorAll('.frame text:not(.label)')];
+      const across = ticks.filter(t => t.getAttribute('text-anchor') === 'middle');
+      const read = t => [Number(t.getAttribute('x')), Number(t.textContent)];
+      const [a, b] = [read(across[0]), read(across[across.length - 1])];
+      return {{x: a[1] + (at.x - a[0]) / (b[0] - a[0]) * (b[1] - a[1]), span: Math.abs(b[1] - a[1]), ticks: across.length,
+               true: state.x[0] + (line.x - state.box[0]) / (state.box[2] - state.box[0]) * (state.x[1] - state.x[0])}}; }})()"""
+    rest = page.run(script)
+    assert rest["x"] == pytest.approx(rest["true"], abs=1e-3)
+    button = f"document.querySelectorAll('#{section} .zoom button')"
+    page.run(f"{button}[0].click(); {button}[0].click(); {button}[0].click()")
+    near = page.run(script)
+    assert near["x"] == pytest.approx(rest["true"], abs=1e-2) and near["span"] < 0.5 * rest["span"] and near["ticks"] >= 2
+    move = (
+        f"(() => {{ const map = document.querySelector('#{section} svg[data-zoom]'), b = map.getBoundingClientRect();"
+        "const at = (type, dx) => new PointerEvent(type, {bubbles: true, button: 0, pointerId: 1, clientX: b.left + 300 + dx,"
+        " clientY: b.top + 150});"
+        "map.dispatchEvent(at('pointerdown', 0)); map.dispatchEvent(at('pointermove', 40)); map.dispatchEvent(at('pointerup', 40));"
+        "return map.querySelector('.scene').getAttribute('transform'); })()"
+    )
+    before = page.run(f"document.querySelector('#{section} .scene').getAttribute('transform')")
+    after = page.run(move)
+    assert after != before and page.run(script)["x"] == pytest.approx(rest["true"], abs=1e-2)
+    page.run(f"{button}[2].click()")
+    home = page.run(script)
+    assert home["x"] == pytest.approx(rest["true"], abs=1e-3) and home["span"] == pytest.approx(rest["span"])
+    assert page.errors == []
+
+
+def test_dots_keep_their_size_and_a_drag_is_no_click(page: Browser) -> None:
+    radius = "document.querySelector('#map .scene circle').getBoundingClientRect().width"
+    before = page.run(radius)
+    page.run("document.querySelectorAll('#map .zoom button')[0].click()")
+    assert page.run(radius) == pytest.approx(before, rel=0.05)
+    page.run(
+        "(() => { const dot = document.querySelector('#map [data-card=\"1\"] circle'), b = dot.getBoundingClientRect();"
+        "const at = (kind, type, dx) => new kind(type, {bubbles: true, button: 0, pointerId: 1, clientX: b.left + dx, clientY: b.top});"
+        "dot.dispatchEvent(at(PointerEvent, 'pointerdown', 0)); dot.dispatchEvent(at(PointerEvent, 'pointermove', 30));"
+        "dot.dispatchEvent(at(PointerEvent, 'pointerup', 30)); dot.dispatchEvent(at(MouseEvent, 'click', 30)); })()"
+    )
+    assert not page.run("document.getElementById('views').open")
+    page.run("document.querySelectorAll('#map .zoom button')[2].click()")
 
 
 def test_heat_map_tells_the_weights_of_the_file(page: Browser, run_folder: Path) -> None:
@@ -136,7 +232,8 @@ def test_cards_sort_and_filter(page: Browser) -> None:
     assert set(page.run("[...document.querySelectorAll('.card:not(.off)')].map(x => x.dataset.category)")) == {"0"}
     choose("filter", "all")
     assert page.run("document.querySelectorAll('.card.off').length") == 0
-    assert page.run("document.querySelectorAll('.card img').length") == 3 * len(spread) - 2  # one has no decoded shape
+    pictures = page.run("document.querySelectorAll('.card .pictures img').length")
+    assert pictures == 3 * len(spread) - 2  # one has no decoded shape
 
 
 def test_theme_switch_changes_the_colours(page: Browser) -> None:

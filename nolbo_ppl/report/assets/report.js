@@ -30,7 +30,126 @@
     });
   }
 
-  // A landmark of a map leads to its card.
+  // Maps are moved by dragging and zoomed by buttons, keys, a double click, two fingers, or the wheel with Ctrl.
+  const SVG = "http://www.w3.org/2000/svg";
+  const roundTicks = (low, high, count) => {
+    const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
+    const step = power * ([1, 2, 5, 10].find((factor) => factor * power >= raw * (1 - 1e-9)) || 10);
+    const ticks = [];
+    for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i++) ticks.push(i * step);
+    return { ticks, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) };
+  };
+  const make = (tag, attributes, text) => {
+    const made = document.createElementNS(SVG, tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    if (text !== undefined) made.textContent = text;
+    return made;
+  };
+  for (const map of all("svg[data-zoom]")) {
+    const { x, y, box } = JSON.parse(map.dataset.zoom), [left, top, right, bottom] = box;
+    const scene = map.querySelector(".scene"), frame = map.querySelector(".frame");
+    const round = all("circle", scene).map((mark) => [mark, Number(mark.getAttribute("r"))]);
+    const square = all("rect", scene).map((mark) => [mark, ...["x", "y", "width", "height"].map((name) => Number(mark.getAttribute(name)))]);
+    const width = map.viewBox.baseVal.width;
+    let k = 1, u = 0, v = 0;
+    const draw = () => {
+      scene.setAttribute("transform", `translate(${u} ${v}) scale(${k})`);
+      for (const [mark, r] of round) mark.setAttribute("r", r / k);
+      for (const [mark, a, b, w, h] of square) {
+        for (const [name, value] of [["x", a + w / 2 - w / 2 / k], ["y", b + h / 2 - h / 2 / k], ["width", w / k], ["height", h / k]]) mark.setAttribute(name, value);
+      }
+      const across = (p) => x[0] + ((p - u) / k - left) / (right - left) * (x[1] - x[0]);
+      const up = (p) => y[0] + (bottom - (p - v) / k) / (bottom - top) * (y[1] - y[0]);
+      for (const old of all("line, text:not(.label)", frame)) old.remove();
+      const horizontal = roundTicks(across(left), across(right), Math.max(2, Math.floor((right - left) / 90)));
+      for (const value of horizontal.ticks) {
+        const p = k * (left + (value - x[0]) / (x[1] - x[0]) * (right - left)) + u;
+        frame.append(make("line", { x1: p, x2: p, y1: bottom, y2: top }), make("text", { x: p, y: bottom + 16, "text-anchor": "middle" }, value.toFixed(horizontal.digits)));
+      }
+      const vertical = roundTicks(up(bottom), up(top), Math.max(2, Math.floor((bottom - top) / 42)));
+      for (const value of vertical.ticks) {
+        const p = k * (bottom - (value - y[0]) / (y[1] - y[0]) * (bottom - top)) + v;
+        frame.append(make("line", { x1: left, x2: right, y1: p, y2: p }), make("text", { x: left - 7, y: p + 3.5, "text-anchor": "end" }, value.toFixed(vertical.digits)));
+      }
+      map.classList.toggle("moved", k !== 1 || u !== 0 || v !== 0);
+    };
+    const place = (event) => {
+      const seen = map.getBoundingClientRect();
+      return [(event.clientX - seen.left) * width / seen.width, (event.clientY - seen.top) * width / seen.width];
+    };
+    const zoom = (factor, at = [(left + right) / 2, (top + bottom) / 2]) => {
+      const next = Math.min(100, Math.max(0.02, k * factor));
+      u = at[0] - (at[0] - u) * next / k;
+      v = at[1] - (at[1] - v) * next / k;
+      k = next;
+      draw();
+    };
+    const move = (du, dv) => { u += du; v += dv; draw(); };
+    const home = () => { k = 1; u = v = 0; draw(); };
+    const bar = document.createElement("div");
+    bar.className = "zoom";
+    for (const [sign, name, work] of [["+", "Zoom in", () => zoom(1.6)], ["\u2212", "Zoom out", () => zoom(1 / 1.6)], ["\u2922", "Whole map", home]]) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = sign;
+      button.title = `${name} (drag to move, Ctrl and the wheel or two fingers to zoom)`;
+      button.setAttribute("aria-label", name);
+      button.addEventListener("click", work);
+      bar.append(button);
+    }
+    map.before(bar);
+    map.setAttribute("tabindex", "0");
+    map.addEventListener("keydown", (event) => {
+      const keys = { "+": () => zoom(1.6), "=": () => zoom(1.6), "-": () => zoom(1 / 1.6), "0": home, ArrowLeft: () => move(60, 0), ArrowRight: () => move(-60, 0), ArrowUp: () => move(0, 60), ArrowDown: () => move(0, -60) };
+      if (!keys[event.key] || event.ctrlKey || event.metaKey) return;
+      event.preventDefault();
+      keys[event.key]();
+    });
+    map.addEventListener("wheel", (event) => {
+      if (!event.ctrlKey && !event.metaKey) return;
+      event.preventDefault();
+      zoom(Math.exp(-0.002 * event.deltaY), place(event));
+    }, { passive: false });
+    map.addEventListener("dblclick", (event) => zoom(2, place(event)));
+    const down = new Map();
+    let dragged = false;
+    map.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
+      if (!down.size) dragged = false;
+      down.set(event.pointerId, place(event));
+    });
+    map.addEventListener("pointermove", (event) => {
+      const before = down.get(event.pointerId);
+      if (!before) return;
+      const now = place(event);
+      if (down.size === 2) {
+        const other = [...down].find(([id]) => id !== event.pointerId)[1];
+        const spread = (point) => Math.max(1, Math.hypot(point[0] - other[0], point[1] - other[1]));
+        dragged = true;
+        down.set(event.pointerId, now);
+        return zoom(spread(now) / spread(before), [(now[0] + other[0]) / 2, (now[1] + other[1]) / 2]);
+      }
+      if (!dragged && Math.hypot(now[0] - before[0], now[1] - before[1]) < 4) return;
+      if (!dragged && map.setPointerCapture && event.isTrusted) map.setPointerCapture(event.pointerId);
+      dragged = true;
+      down.set(event.pointerId, now);
+      move(now[0] - before[0], now[1] - before[1]);
+    });
+    for (const name of ["pointerup", "pointercancel"]) addEventListener(name, (event) => down.delete(event.pointerId));
+    map.addEventListener("click", (event) => { if (dragged) { event.stopPropagation(); dragged = false; } }, true);
+  }
+
+  // A landmark of a map shows all its views, or else leads to its card.
+  const sheet = document.getElementById("views");
+  const show = (card) => {
+    const views = card.querySelector(".views");
+    if (!views || !sheet || !sheet.showModal) return false;
+    const copy = views.cloneNode(true);
+    copy.open = true;
+    sheet.querySelector(".sheet").replaceChildren(card.querySelector("h3").cloneNode(true), copy);
+    sheet.showModal();
+    return true;
+  };
   document.addEventListener("click", (event) => {
     const owner = event.target.closest("[data-card]");
     const card = owner && document.getElementById("card-" + owner.dataset.card);
@@ -38,7 +157,11 @@
     all(".card.lit").forEach((other) => other.classList.remove("lit"));
     card.classList.remove("off");
     card.classList.add("lit");
-    card.scrollIntoView({ block: "center" });
+    if (!show(card)) card.scrollIntoView({ block: "center" });
+  });
+  if (sheet) sheet.addEventListener("click", (event) => {
+    if (event.target === sheet || event.target.closest("[data-close]")) sheet.close();
+    if (event.target.closest("[data-to-card]")) all(".card.lit").forEach((card) => card.scrollIntoView({ block: "center" }));
   });
 
   // Cards are sorted and filtered.
