@@ -56,7 +56,7 @@ def is_file(path: str | os.PathLike[str]) -> bool:
     """Whether there is a regular file; false, too, for names that no file can have."""
     try:
         return Path(path).is_file()
-    except OSError:
+    except (OSError, UnicodeEncodeError):
         return False
 
 
@@ -76,7 +76,7 @@ def inside(folder: str | os.PathLike[str], name: str, *, follow: bool = False) -
         return path
     try:
         return path if path.resolve().is_relative_to(root) else None
-    except (OSError, RuntimeError):  # names that are too long; links in a circle
+    except (OSError, RuntimeError, UnicodeEncodeError):  # names that are too long, or no text; links in a circle
         return None
 
 

@@ -378,6 +378,7 @@ def read_run(
     observations: str | PathLike[str] | None = None,
     truth: str | PathLike[str] | None = None,
     pictures: str | PathLike[str] | None = None,
+    unfinished: bool = False,
 ) -> RunFolder:
     """Read the folder of `nolbo run` or of `nolbo slam`, all of it but voxels, so that what is wrong is said at once.
 
@@ -388,6 +389,7 @@ def read_run(
         truth: true trajectory, when it is not in the folder as `truth.txt`.
         pictures: folder of the images: those outside of the run's folder and of this one are not read, whatever
             `frames.jsonl` says.
+        unfinished: before there is a result, the odometry stands for the estimate.
 
     Raises:
         InputError: no such folder, no trajectory and map in it, or a file that is malformed or does not match.
@@ -396,7 +398,9 @@ def read_run(
     if not run.path.is_dir():
         raise input_error("no such folder of a run", file=run.path)
     settle(run.path)
-    if not (run.slam / "trajectory.txt").is_file():
+    if unfinished and not (run.slam / "trajectory.txt").is_file() and run.odometry is not None:
+        run._keep(estimate=run.odometry)
+    elif not (run.slam / "trajectory.txt").is_file():
         raise input_error(
             "no result of a run in this folder",
             expected="trajectory.txt or slam/trajectory.txt",

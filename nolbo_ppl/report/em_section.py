@@ -10,7 +10,7 @@ import numpy as np
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 from nolbo_ppl.report.report_plots import above, axis_label, near, path_lines
-from nolbo_ppl.report.svg import Axes, element, equal_axes, escape, number, picture, text
+from nolbo_ppl.report.svg import Axes, element, equal_axes, escape, number, picture, text, zoomable
 from nolbo_ppl.report.wording import say, table
 
 MOST_POSES = 600
@@ -78,7 +78,7 @@ def em_slider(run: RunFolder) -> str:
     moving += element("polyline", points=data[-1]["way"], class_="line estimate", data_em="way")
     first = axes.line(every[0], class_="line odometry faint")
     parts = [first, path_lines(run, axes, ("truth",)), moving]
-    plot = chart(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Trajectory and landmarks at an iteration of EM")
+    plot = zoomable(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Trajectory and landmarks at an iteration of EM")
     last = len(iterations) - 1
     controls = element("button", "Play", type="button", data_em="play")
     controls += element("input", type="range", min=0, max=last, value=last, step=1, aria_label="Iteration", data_em="slider")

@@ -67,7 +67,7 @@ def all_views(run: RunFolder, landmark: Landmark) -> str:
         except InputError:
             continue
         caption = f"frame {view.frame}" + ("" if view.weight >= WHOLE else f", weight {view.weight:.2f}")
-        picture = f'<img src="{uri}" alt="{escape(f"{landmark.name} in frame {view.frame}")}" loading="lazy">'
+        picture = f'<img src="{uri}" alt="{escape(f"{landmark.name} in frame {view.frame}")}">'
         shown += element("figure", picture + element("figcaption", escape(caption)))
     told = f"{len(found.pictures)} of {found.count} views" if len(found.pictures) < found.count else f"all {found.count} views"
     return (
@@ -117,11 +117,7 @@ def card(run: RunFolder, k: int) -> str:
     body = pictures(run, landmark) + posterior_bars(run, landmark) + facts(landmark) + all_views(run, landmark)
     return element(
         "article",
-        element("h3", dot + element("span", name))
-        + pictures(run, landmark)
-        + posterior_bars(run, landmark)
-        + facts(landmark)
-        + all_views(run, landmark),
+        element("h3", dot + element("span", name)) + body,
         id=f"card-{k}",
         class_="card",
         data_detections=float(np.nan_to_num(landmark.detections)),

@@ -11,7 +11,7 @@ from nolbo_ppl.geometry.pose import relative, rotation_angle
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import align
 from nolbo_ppl.report.loop_section import Loop, is_right
-from nolbo_ppl.report.svg import CHI2_95, Axes, chart, element, equal_axes, group, number, picture
+from nolbo_ppl.report.svg import CHI2_95, Axes, element, equal_axes, group, number, picture, zoomable
 from nolbo_ppl.report.wording import say
 from nolbo_ppl.structures.landmark import Landmark
 from nolbo_ppl.viz.style import MUTED, category_colour
@@ -92,7 +92,7 @@ def trajectory_plot(run: RunFolder) -> str:
     axes = map_axes(run, landmarks=False)
     xy = above(run, run.estimate[:, :3, 3])
     parts = [path_lines(run, axes, [name for name, _ in LINES]), _ends(axes, xy)]
-    return chart(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Trajectories from above")
+    return zoomable(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Trajectories from above")
 
 
 def landmark_tip(landmark: Landmark) -> str:
@@ -151,7 +151,7 @@ def map_plot(run: RunFolder) -> str:
     """The map from above."""
     axes = map_axes(run)
     parts = [path_lines(run, axes, ("truth", "estimate")), landmark_marks(run, axes)]
-    return chart(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Map from above")
+    return zoomable(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Map from above")
 
 
 def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
@@ -170,7 +170,7 @@ def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
         tip += f"\n{kind}" if kind else ""
         parts.append(group([axes.line(corner, class_=f"loop {kind}", style=style, data_tip=tip)], data_layer=kind or "loops"))
     drawn = [path_lines(run, axes, ("estimate",)), *parts, landmark_marks(run, axes, ellipses=False)]
-    return chart(axes, (axis_label(run, 0), axis_label(run, 1)), drawn, "Loop closures")
+    return zoomable(axes, (axis_label(run, 0), axis_label(run, 1)), drawn, "Loop closures")
 
 
 def clock(run: RunFolder) -> tuple[Float[np.ndarray, " n"], str]:

@@ -168,7 +168,7 @@ def picture(axes: Axes, parts: Iterable[str], label: str, **attributes: object) 
     )
 
 
-def chart(axes: Axes, labels: tuple[str, str], parts: Iterable[str], label: str) -> str:
+def zoomable(axes: Axes, labels: tuple[str, str], parts: Iterable[str], label: str) -> str:
     """A map that the page's script zooms and moves: axes that are drawn anew, and a scene inside of them.
 
     Without the script it is the same picture at rest.

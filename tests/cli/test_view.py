@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import re
+import shutil
 import threading
+import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +18,9 @@ import pytest
 from nolbo_ppl.cli.view import ViewerConfig, main, run
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import quaternion_to_matrix
+from nolbo_ppl.io.files import write_json
 from nolbo_ppl.report import read_run
+from nolbo_ppl.report.run_follower import RunFollower
 from nolbo_ppl.report.viewer import Viewer, build_viewer
 from tests.report.browser import Browser
 from tests.report.factory import FRAMES, make_run
@@ -129,6 +135,68 @@ def test_verb_serves_until_it_is_stopped(folder: Path, capsys: pytest.CaptureFix
     stop.set()
     run(ViewerConfig(folder, port=PORT + 50, browser=False), stop)
     assert re.search(r"http://localhost:\d+", capsys.readouterr().out)
+
+
+def test_a_run_that_is_still_going_is_followed(folder: Path, server: viser.ViserServer, tmp_path: Path) -> None:
+    """Stage by stage: nothing yet, odometry alone, the result; a stage that is taken away leaves what was shown."""
+    going = tmp_path / "going"
+    going.mkdir()
+    write_json(going / "run.json", {"format": 2, "complete": []})
+    follower = RunFollower(going, partial(read_run, going, unfinished=True), server)
+    assert not follower.refresh() and follower.viewer is None
+    for name in ("odometry.txt", "frames.jsonl", "intrinsics.json"):
+        shutil.copy(folder / name, going / name)
+    write_json(going / "run.json", {"format": 2, "complete": ["odometry"]})
+    assert follower.refresh() and follower.viewer is not None
+    assert {"odometry", "keyframe", "cameras"} <= set(follower.viewer.layers) and "objects" not in follower.viewer.layers
+    assert "odometry" in follower.viewer.gui["stages"].content
+    assert not follower.refresh()  # nothing new
+    shutil.copytree(folder / "slam", going / "slam")
+    write_json(going / "run.json", {"format": 2, "complete": ["odometry", "observe", "slam"]})
+    assert follower.refresh() and "objects" in follower.viewer.layers
+    shown = follower.viewer
+    (going / "slam" / "landmarks.json").write_text("[")
+    assert not follower.refresh() and follower.viewer is shown
+
+
+def test_the_verb_follows_behind_the_guard(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A page served before the first stage, with its token; strangers are refused; a stage that ends is shown."""
+    going = tmp_path / "going"
+    going.mkdir()
+    write_json(going / "run.json", {"format": 2, "complete": []})
+    stop, shown = threading.Event(), threading.Event()
+    refresh = RunFollower.refresh
+
+    def told(self: RunFollower) -> bool:
+        new = refresh(self)
+        if new:
+            shown.set()
+        return new
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunFollower, "refresh", told)
+        config = ViewerConfig(going, port=PORT + 70, browser=False, poll=0.05)
+        thread = threading.Thread(target=run, args=(config, stop))
+        thread.start()
+        try:
+            address, text = None, ""
+            for _ in range(600):
+                text += capsys.readouterr().out
+                if (match := re.search(r"http://\S+token=\S+", text)) is not None:
+                    address = match.group(0)
+                    break
+                time.sleep(0.1)
+            assert address is not None
+            with urllib.request.urlopen(address, timeout=60) as answer:
+                assert answer.status == 200
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(address.split("?")[0], timeout=60)
+            assert not shown.is_set()
+            shutil.copy(folder / "odometry.txt", going / "odometry.txt")
+            assert shown.wait(60)
+        finally:
+            stop.set()
+            thread.join(60)
 
 
 def test_slam_folder_alone_is_shown(folder: Path, server: viser.ViserServer) -> None:

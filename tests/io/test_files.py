@@ -143,6 +143,7 @@ def test_names_stay_within_their_folder(tmp_path: Path) -> None:
     (folder / "circle").symlink_to(folder / "circle")
     for name in ("../secret.png", "/etc/passwd", "link.png", "deep/../../secret.png", "", "a\0b", "circle"):
         assert inside(folder, name) is None, name
+    assert inside(folder, "half \ud800 a pair") is None
     for name in ("a.png", "deep/../a.png", "images/000.png"):
         assert inside(folder, name) == folder / name
 

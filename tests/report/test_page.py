@@ -172,7 +172,8 @@ def test_maps_zoom_and_move_with_their_axes(page: Browser, section: str) -> None
         f"(() => {{ const map = document.querySelector('#{section} svg[data-zoom]'), b = map.getBoundingClientRect();"
         "const at = (type, dx) => new PointerEvent(type, {bubbles: true, button: 0, pointerId: 1, clientX: b.left + 300 + dx,"
         " clientY: b.top + 150});"
-        "map.dispatchEvent(at('pointerdown', 0)); map.dispatchEvent(at('pointermove', 40)); map.dispatchEvent(at('pointerup', 40));"
+        "map.dispatchEvent(at('pointerdown', 0)); map.dispatchEvent(at('pointermove', 40));"
+        "map.dispatchEvent(at('pointerup', 40));"
         "return map.querySelector('.scene').getAttribute('transform'); })()"
     )
     before = page.run(f"document.querySelector('#{section} .scene').getAttribute('transform')")
@@ -191,7 +192,8 @@ def test_dots_keep_their_size_and_a_drag_is_no_click(page: Browser) -> None:
     assert page.run(radius) == pytest.approx(before, rel=0.05)
     page.run(
         "(() => { const dot = document.querySelector('#map [data-card=\"1\"] circle'), b = dot.getBoundingClientRect();"
-        "const at = (kind, type, dx) => new kind(type, {bubbles: true, button: 0, pointerId: 1, clientX: b.left + dx, clientY: b.top});"
+        "const at = (kind, type, dx) => new kind(type, {bubbles: true, button: 0, pointerId: 1, clientX: b.left + dx,"
+        " clientY: b.top});"
         "dot.dispatchEvent(at(PointerEvent, 'pointerdown', 0)); dot.dispatchEvent(at(PointerEvent, 'pointermove', 30));"
         "dot.dispatchEvent(at(PointerEvent, 'pointerup', 30)); dot.dispatchEvent(at(MouseEvent, 'click', 30)); })()"
     )
