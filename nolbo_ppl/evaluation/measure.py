@@ -119,6 +119,7 @@ def _position_densities(
     log_determinant = np.linalg.slogdet(2 * np.pi * covariance)[1]
     law = tails or StudentT(GAUSSIAN_DOF, 1.0)
     return {
+        "position_squared": squared,
         "position_log_density": -0.5 * (squared + log_determinant),
         "position_tails_mass": law.mass(squared, 3),
         "position_tails_log_density": law.log_density(squared, log_determinant, 3),

@@ -46,6 +46,8 @@ class ObjectRecords:
     """Mass of the region of elevation and in-plane rotation that reaches to the truth."""
     position_mass: Float[np.ndarray, " n"]
     """Mass of the region of the position that reaches to the truth."""
+    position_squared: Float[np.ndarray, " n"]
+    """Squared distance of the true position under the stated covariance."""
     position_log_density: Float[np.ndarray, " n"]
     """Log density of the position's Gaussian at the truth, nats per m^3."""
     position_tails_mass: Float[np.ndarray, " n"]

@@ -1,0 +1,83 @@
+"""Tails of the positions and the largest certainty of a model, fitted on scenes of one seed and measured on those of another.
+
+    OMP_NUM_THREADS=1 python benchmarks/observation_tails.py [--model tiny] [--scenes 200] [--seed 8801] [--write]
+
+Half of the scenes are standard, half full. With `--write` both numbers go into the model's config.json.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import nolbo_ppl
+from nolbo_ppl.cli.evaluate import EvaluateConfig, Evaluation, measure, open_scenes
+from nolbo_ppl.evaluation.scores import judged
+from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.io.files import read_json, write_json
+from nolbo_ppl.models.posterior_calibration import CERTAIN
+from nolbo_ppl.training.calibrate_answers import calibrate_answers
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to fit and on how many scenes."""
+
+    model: str = "tiny"
+    """Model (a name or a folder)."""
+    scenes: int = 200
+    """Scenes of each of the two difficulties."""
+    seed: int = 8801
+    """Their seed."""
+    write: bool = False
+    """Write the two numbers into the model's folder."""
+
+
+def answers(model: ObservationModel, arguments: Arguments) -> list[Evaluation]:
+    """The model's answers on both kinds of scenes."""
+    out = []
+    for difficulty in ("standard", "full"):
+        config = EvaluateConfig(
+            Path("unused"),
+            model=arguments.model,
+            count=arguments.scenes,
+            seed=arguments.seed,
+            difficulty=difficulty,
+            resamples=10,
+        )
+        out.append(measure(config, model, open_scenes(config, model.config)))
+    return out
+
+
+def main(arguments: Arguments) -> None:
+    """Fit, and write where asked."""
+    model = load(arguments.model)
+    plain = dataclasses.replace(model.calibration, objectness_limit=CERTAIN)
+    found = answers(ObservationModel(model.model, plain), arguments)
+    squared = np.concatenate([one.objects.position_squared for one in found])
+    squared = squared[np.isfinite(squared)]
+    detections = [one.detections.all.select(judged(one.detections.all)) for one in found]
+    score, right = (np.concatenate([getattr(d, name) for d in detections]) for name in ("score", "correct"))
+    fitted = calibrate_answers(plain, squared, score, right)
+    sure = score > 0.99
+    print(
+        f"{len(squared)} positions, {len(score)} detections, {sure.sum()} above 0.99, of which {right[sure].mean():.4f} are right"
+    )
+    print(
+        f"degrees of freedom {fitted.position_dof:.3f}, spread {fitted.position_spread:.3f}, limit {fitted.objectness_limit:.5f}"
+    )
+    if arguments.write:
+        given = Path(arguments.model)
+        file = (given if given.is_dir() else Path(nolbo_ppl.__file__).parent / "weights" / given) / "config.json"
+        values = read_json(file)
+        values["calibration"] = fitted.to_json()
+        write_json(file, values)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
