@@ -20,7 +20,7 @@ from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 T = TypeVar("T")
 
 
-class Scenes(Protocol):
+class BatchedScenes(Protocol):
     """Scenes that can be gathered by number: `CachedScenes`, `SceneFolder`."""
 
     def __len__(self) -> int:
@@ -52,7 +52,7 @@ def batch_indices(total: int, batch_size: int, seed: int, step: int) -> Int[np.n
     return result
 
 
-def shuffled_batches(scenes: Scenes, batch_size: int, seed: int, start: int = 0) -> Iterator[Arrays]:
+def shuffled_batches(scenes: BatchedScenes, batch_size: int, seed: int, start: int = 0) -> Iterator[Arrays]:
     """Endless shuffled batches from step `start` on; step s is the same whatever `start` was."""
     total = len(scenes)
     for step in count(start):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
+from nolbo_ppl.evaluation.measure import ShapeModel
 from nolbo_ppl.evaluation.sequence_truth import MatchResult, SequenceGroundTruth
 from nolbo_ppl.geometry.alignment import known_rows, pose_alignment
 from nolbo_ppl.geometry.rotation import egocentric_to_allocentric, matrix_to_viewpoint
@@ -29,16 +30,6 @@ REPEATS = 4
 """Draws of the views of one object."""
 TRUE_SIDE = 32
 """Voxels along a side of a drive's true grids."""
-
-
-class ShapeModel(Protocol):
-    """What the figures of shapes need (`nolbo_ppl.inference.posterior.predictor.ObservationModel`)."""
-
-    def decode(self, latent: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n v v v"]:
-        """Occupancy probabilities of latents."""
-
-    def shape_posterior(self, packed: UInt8[np.ndarray, "n bytes"]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Mean and scale of the latent of true shapes."""
 
 
 def finite(value: float) -> float | None:

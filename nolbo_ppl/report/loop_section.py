@@ -16,7 +16,7 @@ LOOP_GAP = 50
 
 
 @dataclass(frozen=True)
-class Loop:
+class FoundLoop:
     """A landmark seen again."""
 
     landmark: int
@@ -36,7 +36,7 @@ def loop_gap(run: RunFolder) -> int:
     return min(LOOP_GAP, max(len(run) // 4, 2))
 
 
-def find_loops(found: AssociationTable, gap: int) -> list[Loop]:
+def find_loops(found: AssociationTable, gap: int) -> list[FoundLoop]:
     """Every return to a landmark after more than `gap` frames, by its detections of weight above one half.
 
     Needs the frames of the detections; without them there are none.
@@ -47,7 +47,7 @@ def find_loops(found: AssociationTable, gap: int) -> list[Loop]:
     for j in np.unique(label[label >= 0]):
         frames: Int[np.ndarray, " v"] = np.unique(found.frame[label == j])
         for k in np.flatnonzero(np.diff(frames) > gap):
-            loops.append(Loop(int(j), int(frames[k]), int(frames[k + 1])))
+            loops.append(FoundLoop(int(j), int(frames[k]), int(frames[k + 1])))
     return sorted(loops, key=lambda loop: loop.after)
 
 
@@ -61,7 +61,7 @@ def object_labels(run: RunFolder) -> Int[np.ndarray, " k"] | None:
     return np.array([number[run.objects[i]] if i in run.objects else -2 for i in run.associations_in_time.id], dtype=np.int64)
 
 
-def is_right(run: RunFolder, loop: Loop) -> bool | None:
+def is_right(run: RunFolder, loop: FoundLoop) -> bool | None:
     """Whether both ends of a loop are one true object; None when truth does not say."""
     label = object_labels(run)
     found = run.associations_in_time

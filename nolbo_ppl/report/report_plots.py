@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from nolbo_ppl.geometry.pose import relative, rotation_angle
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.metrics.trajectory import align
-from nolbo_ppl.report.loop_section import Loop, is_right
+from nolbo_ppl.report.loop_section import FoundLoop, is_right
 from nolbo_ppl.report.svg import CHI2_95, Axes, element, equal_axes, group, number, picture, zoomable
 from nolbo_ppl.report.wording import say
 from nolbo_ppl.structures.landmark import Landmark
@@ -154,7 +154,7 @@ def map_plot(run: RunFolder) -> str:
     return zoomable(axes, (axis_label(run, 0), axis_label(run, 1)), parts, "Map from above")
 
 
-def loop_plot(run: RunFolder, loops: Sequence[Loop]) -> str:
+def loop_plot(run: RunFolder, loops: Sequence[FoundLoop]) -> str:
     """The corrected way with a line from each landmark to the two places it was seen from."""
     axes = map_axes(run)
     way = above(run, run.estimate[:, :3, 3])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.data.augment import Augmentation, augment
-from nolbo_ppl.data.loader import Scenes, batch_indices
+from nolbo_ppl.data.loader import BatchedScenes, batch_indices
 from nolbo_ppl.data.mirror import mirror, mirror_voxels
 from nolbo_ppl.data.scene_cache import CachedScenes
 from nolbo_ppl.errors import input_error
@@ -40,7 +40,7 @@ def to_batch(arrays: Arrays) -> SceneBatch:
 class SceneSubset:
     """Some scenes of a data set as a data set."""
 
-    def __init__(self, scenes: Scenes, index: Int[np.ndarray, " n"]) -> None:
+    def __init__(self, scenes: BatchedScenes, index: Int[np.ndarray, " n"]) -> None:
         self.scenes, self.index = scenes, index
 
     def __len__(self) -> int:
@@ -194,7 +194,7 @@ class SceneLoader:
 
     def __init__(
         self,
-        scenes: Scenes,
+        scenes: BatchedScenes,
         table: ShapeTable,
         batch_size: int,
         seed: int,

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.dataset_folder import SceneFolder
-from nolbo_ppl.data.loader import Scenes, prefetch
+from nolbo_ppl.data.loader import BatchedScenes, prefetch
 from nolbo_ppl.data.scene_cache import write_cache
 from nolbo_ppl.devices import each_pinned
 from nolbo_ppl.errors import input_error
@@ -47,11 +47,11 @@ class TrainingData:
         self.augmentation: Augmentation | None = None
         if config.augment:
             self.augmentation = Augmentation(mirror_probability=0.5 if config.mirror and not config.instance_labels else 0.0)
-        self.train: Scenes
-        self.single: Scenes
-        self._held_out: Scenes
-        self._mix: list[tuple[Scenes, ShapeTable, int]] = []
-        self._held_out_mix: list[tuple[Scenes, ShapeTable]] = []
+        self.train: BatchedScenes
+        self.single: BatchedScenes
+        self._held_out: BatchedScenes
+        self._mix: list[tuple[BatchedScenes, ShapeTable, int]] = []
+        self._held_out_mix: list[tuple[BatchedScenes, ShapeTable]] = []
         if len(config.scenes) + config.generated > 1:
             self._open_mix()
         elif config.scenes:
@@ -176,7 +176,7 @@ class TrainingData:
             return each_pinned(shapes(), self.device)
         seed = 3 * config.seed + (1 if stage == "single" else 2)  # one for all parts: they choose the same size
 
-        def loader_of(scenes: Scenes, table: ShapeTable, batch: int) -> SceneLoader:
+        def loader_of(scenes: BatchedScenes, table: ShapeTable, batch: int) -> SceneLoader:
             return SceneLoader(
                 scenes, table, batch, seed, latent, self.augmentation, self.model.image_size, config.sizes,
                 len(self.model.instances), self.rank, self.world, crop=self._crop,

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from nolbo_ppl.evaluation.labelled_scenes import Scenes
+
 SHOWN = 0.3
 """Least objectness of a detection that is drawn and counted."""
 AREA = 26.0
@@ -25,14 +27,7 @@ AREA = 26.0
 
 
 @runtime_checkable
-class Scenes(Protocol):
-    """Labelled scenes by number."""
-
-    def __getitem__(self, index: int) -> Annotations: ...
-
-
-@runtime_checkable
-class Model(Protocol):
+class DetectionModel(Protocol):
     """What the pictures need of a model (`nolbo_ppl.inference.posterior.predictor.ObservationModel`)."""
 
     def observe(self, images: Any, intrinsics: Any, *, threshold: float, decode: bool) -> list[ObjectPosteriors]:
@@ -57,7 +52,7 @@ def choose_scenes(found: Matches, each: int) -> dict[str, list[int]]:
     return {name: [int(row) for row in rows] for name, rows in chosen.items()}
 
 
-def write_detections(found: Matches, scenes: Scenes, model: Model, path: str | PathLike[str]) -> Figure | None:
+def write_detections(found: Matches, scenes: Scenes, model: DetectionModel, path: str | PathLike[str]) -> Figure | None:
     """Draw scenes with the detections of some objectness, the true boxes dashed, regions that are not judged hatched.
 
     Returns:

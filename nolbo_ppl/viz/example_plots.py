@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.evaluation.records import ObjectRecords
 from nolbo_ppl.geometry.voxels import unpack_voxels
-from nolbo_ppl.structures.annotations import Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from nolbo_ppl.viz.overlay import draw_frame, show_part
 from nolbo_ppl.viz.shape_plots import draw_shape
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
+    from nolbo_ppl.evaluation.labelled_scenes import Scenes
+
 COLUMNS = 5
 """Examples of each kind."""
 TRUE_AXES = ("white", "white", "white")
@@ -28,14 +29,7 @@ TRUE_AXES = ("white", "white", "white")
 
 
 @runtime_checkable
-class Scenes(Protocol):
-    """Labelled scenes by number."""
-
-    def __getitem__(self, index: int) -> Annotations: ...
-
-
-@runtime_checkable
-class Model(Protocol):
+class RegionModel(Protocol):
     """What examples need of a model (`nolbo_ppl.inference.posterior.predictor.ObservationModel`)."""
 
     def observe_boxes(self, images: Any, intrinsics: Any, boxes: Any) -> list[ObjectPosteriors]:
@@ -74,7 +68,7 @@ def _varied(rows: Int[np.ndarray, " n"], category: Int[np.ndarray, " n"], count:
     return np.array(sorted(chosen, key=lambda row: int(np.flatnonzero(rows == row)[0])), dtype=np.int64)
 
 
-def write_examples(objects: ObjectRecords, scenes: Scenes, model: Model, path: str | PathLike[str]) -> Figure:
+def write_examples(objects: ObjectRecords, scenes: Scenes, model: RegionModel, path: str | PathLike[str]) -> Figure:
     """Draw the best, median and worst objects: close-up with estimated and true axes, estimated and true shape.
 
     Raises:
@@ -96,7 +90,7 @@ def write_examples(objects: ObjectRecords, scenes: Scenes, model: Model, path: s
 
 
 def _draw_example(
-    figure: Figure, place: SubplotSpec, objects: ObjectRecords, row: int, name: str, scenes: Scenes, model: Model
+    figure: Figure, place: SubplotSpec, objects: ObjectRecords, row: int, name: str, scenes: Scenes, model: RegionModel
 ) -> None:
     """One object: close-up above, shapes below, the figures as its title."""
     truth, slot = scenes[int(objects.scene[row])], int(objects.slot[row])

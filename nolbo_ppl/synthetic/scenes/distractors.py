@@ -13,7 +13,7 @@ KINDS: tuple[str, ...] = ("box", "ball", "cylinder", "cone")
 
 
 @dataclass(frozen=True)
-class Primitive:
+class DistractorPart:
     """A unit primitive placed by an affine map in the frame of its piece of clutter."""
 
     kind: str
@@ -60,11 +60,11 @@ def _turn(rng: np.random.Generator, tilt: float) -> np.ndarray:
     return np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, cb, -sb], [0, sb, cb]])
 
 
-def _primitive(kind: str, size: np.ndarray, rotation: np.ndarray, offset: np.ndarray) -> Primitive:
-    return Primitive(kind, rotation * size[None, :], offset)
+def _primitive(kind: str, size: np.ndarray, rotation: np.ndarray, offset: np.ndarray) -> DistractorPart:
+    return DistractorPart(kind, rotation * size[None, :], offset)
 
 
-def sample_distractors(rng: np.random.Generator) -> tuple[list[Primitive], Float[np.ndarray, "2 3"]]:
+def sample_distractors(rng: np.random.Generator) -> tuple[list[DistractorPart], Float[np.ndarray, "2 3"]]:
     """Draw one piece of clutter and its box (least and greatest corner), scaled to a box diagonal of 1 and centred.
 
     A third are single solids, some are posts and slabs, the rest are heaps of two to five solids.
@@ -91,5 +91,5 @@ def sample_distractors(rng: np.random.Generator) -> tuple[list[Primitive], Float
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = 1.0 / float(np.linalg.norm(high - low))
     centre = 0.5 * (low + high)
-    placed = [Primitive(p.kind, p.linear * scale, (p.offset - centre) * scale) for p in parts]
+    placed = [DistractorPart(p.kind, p.linear * scale, (p.offset - centre) * scale) for p in parts]
     return placed, np.stack((low - centre, high - centre)) * scale

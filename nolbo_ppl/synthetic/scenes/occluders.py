@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.synthetic.scenes.distractors import Primitive, unit_mesh
+from nolbo_ppl.synthetic.scenes.distractors import DistractorPart, unit_mesh
 
 SKIN = ("#f1c9a5", "#e0ac85", "#c68863", "#a16b46", "#7a4a2e", "#4b2c1c")
 HAIR = ("#1a1410", "#3a2618", "#6b4a2a", "#a88a5a", "#777777")
 LEAVES = ("#2f5d2a", "#44772f", "#5f8f3b", "#24481f", "#7d8f3a")
 
 
-def _between(start: np.ndarray, end: np.ndarray, width: float, kind: str = "cylinder") -> Primitive:
+def _between(start: np.ndarray, end: np.ndarray, width: float, kind: str = "cylinder") -> DistractorPart:
     """A limb from one point to another."""
     along = end - start
     length = float(np.linalg.norm(along))
@@ -21,19 +21,19 @@ def _between(start: np.ndarray, end: np.ndarray, width: float, kind: str = "cyli
     x = np.cross(helper, z)
     x /= np.linalg.norm(x)
     R = np.stack((x, np.cross(z, x), z), axis=1)
-    return Primitive(kind, R * np.array([width, width, length]), (start + end) / 2)
+    return DistractorPart(kind, R * np.array([width, width, length]), (start + end) / 2)
 
 
-def _ball(centre: np.ndarray, size: np.ndarray) -> Primitive:
-    return Primitive("ball", np.diag(size), centre)
+def _ball(centre: np.ndarray, size: np.ndarray) -> DistractorPart:
+    return DistractorPart("ball", np.diag(size), centre)
 
 
-def sample_person(rng: np.random.Generator) -> tuple[list[Primitive], list[str]]:
+def sample_person(rng: np.random.Generator) -> tuple[list[DistractorPart], list[str]]:
     """Parts of a person who stands, walks or reaches out, about 1.7 high, and the role of each part's material."""
     skin, hair = f"colour {rng.choice(SKIN)}", f"colour {rng.choice(HAIR)}"
     parts, roles = [], []
 
-    def add(part: Primitive, role: str) -> None:
+    def add(part: DistractorPart, role: str) -> None:
         parts.append(part)
         roles.append(role)
 
@@ -63,22 +63,22 @@ def sample_person(rng: np.random.Generator) -> tuple[list[Primitive], list[str]]
     return parts, roles
 
 
-def sample_plant(rng: np.random.Generator) -> tuple[list[Primitive], list[str]]:
+def sample_plant(rng: np.random.Generator) -> tuple[list[DistractorPart], list[str]]:
     """Parts of a shrub, a tree or a plant in a pot, about 1 high, and the role of each part's material."""
     leaf = [f"colour {rng.choice(LEAVES)}" for _ in range(3)]
     parts, roles = [], []
     low = 0.0
     if rng.random() < 0.4:
         low = rng.uniform(0.15, 0.3)
-        parts.append(Primitive("cylinder", np.diag([0.3, 0.3, low]), np.array([0.0, 0.0, low / 2])))
+        parts.append(DistractorPart("cylinder", np.diag([0.3, 0.3, low]), np.array([0.0, 0.0, low / 2])))
         roles.append("body")
     crown = rng.uniform(low + 0.05, 0.75)
     if rng.random() < 0.25:  # a conifer
-        parts.append(Primitive("cylinder", np.diag([0.07, 0.07, 0.3]), np.array([0.0, 0.0, low + 0.15])))
+        parts.append(DistractorPart("cylinder", np.diag([0.07, 0.07, 0.3]), np.array([0.0, 0.0, low + 0.15])))
         roles.append("wood")
         for k in range(3):
             size = 0.6 - 0.15 * k
-            parts.append(Primitive("cone", np.diag([size, size, 0.4]), np.array([0.0, 0.0, low + 0.35 + 0.22 * k])))
+            parts.append(DistractorPart("cone", np.diag([size, size, 0.4]), np.array([0.0, 0.0, low + 0.35 + 0.22 * k])))
             roles.append(leaf[k])
         return parts, roles
     parts.append(_between(np.array([0.0, 0.0, low]), np.array([0.0, 0.0, crown + 0.1]), rng.uniform(0.02, 0.08)))
@@ -90,16 +90,16 @@ def sample_plant(rng: np.random.Generator) -> tuple[list[Primitive], list[str]]:
             [0.3, 0.3, (1.0 - crown) / 2]
         )
         turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        parts.append(Primitive("ball", turn * rng.uniform(0.08, 0.24) * np.array([1.0, 0.6, 0.2]), centre))
+        parts.append(DistractorPart("ball", turn * rng.uniform(0.08, 0.24) * np.array([1.0, 0.6, 0.2]), centre))
         roles.append(leaf[int(rng.integers(3))])
     return parts, roles
 
 
-def sample_occluder(rng: np.random.Generator) -> tuple[list[Primitive], list[str], Float[np.ndarray, "2 3"]]:
+def sample_occluder(rng: np.random.Generator) -> tuple[list[DistractorPart], list[str], Float[np.ndarray, "2 3"]]:
     """A person or a plant, its parts' roles, and its box; scaled to a box diagonal of 1 and centred, as `sample_distractors`."""
     parts, roles = sample_person(rng) if rng.random() < 0.6 else sample_plant(rng)
     corners = np.concatenate([unit_mesh(p.kind)[0] @ p.linear.T + p.offset for p in parts])
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale, centre = 1.0 / float(np.linalg.norm(high - low)), 0.5 * (low + high)
-    placed = [Primitive(p.kind, p.linear * scale, (p.offset - centre) * scale) for p in parts]
+    placed = [DistractorPart(p.kind, p.linear * scale, (p.offset - centre) * scale) for p in parts]
     return placed, roles, np.stack((low - centre, high - centre)) * scale
