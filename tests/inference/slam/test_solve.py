@@ -78,8 +78,9 @@ def test_answers_carry_uncertainty(solved: tuple[SimulatedSequence, SlamResult])
     assert np.trace(covariance[0]) < 1e-6 < np.trace(covariance[1])
     seen = {int(o) for o in world.object_of if o >= 0}
     assert abs(len(result.landmarks) - len(seen)) <= 0.15 * len(seen)
+    # Clutter is a seventh of the detections: most landmarks are objects, and are believed to be.
+    assert np.mean([landmark.existence > 0.9 for landmark in result.landmarks]) > 0.9
     for landmark in result.landmarks:
-        assert 0 <= landmark.existence <= 1
         assert sum(landmark.class_posterior.values()) == pytest.approx(1.0)
         assert landmark.latent is not None and landmark.latent_variance is not None
         assert (landmark.latent_variance > 0).all()
@@ -217,7 +218,10 @@ def test_poor_input_gives_an_answer(case: str) -> None:
     step_before = np.linalg.norm(np.diff(odometry[:, :3, 3], axis=0), axis=1)
     step_after = np.linalg.norm(np.diff(result.T_world_camera[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(step_after, step_before, rtol=0.1, atol=0.5)
-    assert result.landmarks is not None
+    # One sighting founds no landmark, and there is at most one for each object that was seen.
+    seen = len(np.unique(world.object_of[: len(table)])) if case in ("no loop", "jump") else 1
+    least, most = (1, seen) if case in ("no loop", "jump") else (0, int(case == "one landmark"))
+    assert least <= len(result.landmarks) <= most
 
 
 def test_malformed_problems_raise() -> None:
