@@ -16,7 +16,7 @@ from nolbo_ppl.geometry.voxels import voxel_centres
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.report import read_run
 from nolbo_ppl.report.em_section import json_script
-from nolbo_ppl.report.loop_section import Loop, find_loops, is_right, loop_scores
+from nolbo_ppl.report.loop_section import FoundLoop, find_loops, is_right, loop_scores
 from nolbo_ppl.report.report_plots import map_axes, map_plot, outside
 from nolbo_ppl.report.sections import world_map
 from nolbo_ppl.report.shape_thumbnails import render_shape
@@ -112,9 +112,9 @@ def associations(frames: list[int], labels: list[int]) -> AssociationTable:
 
 def test_loops_are_the_returns_after_the_gap() -> None:
     found = associations([0, 1, 2, 20, 21, 33, 60, 60], [0, 0, 1, 0, 1, 0, 0, -1])
-    assert find_loops(found, 15) == [Loop(0, 1, 20), Loop(1, 2, 21), Loop(0, 33, 60)]
-    assert find_loops(found, 18) == [Loop(0, 1, 20), Loop(1, 2, 21), Loop(0, 33, 60)]
-    assert find_loops(found, 19) == [Loop(0, 33, 60)]
+    assert find_loops(found, 15) == [FoundLoop(0, 1, 20), FoundLoop(1, 2, 21), FoundLoop(0, 33, 60)]
+    assert find_loops(found, 18) == [FoundLoop(0, 1, 20), FoundLoop(1, 2, 21), FoundLoop(0, 33, 60)]
+    assert find_loops(found, 19) == [FoundLoop(0, 33, 60)]
 
 
 def test_loops_of_the_square_are_right(run_folder: Path) -> None:
