@@ -24,6 +24,8 @@ from nolbo_ppl.data.converters import (
 )
 from nolbo_ppl.data.converters.foreign_detections import DetectionFormat, observations_of, read_foreign_detections
 from nolbo_ppl.data.converters.placed_boxes import observations_by_parallax, read_heights, undistorted
+from nolbo_ppl.data.converters.pseudo_labels import MIN_CONFIDENCE, SUSPECTED, write_pseudo_labels
+from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.io.camera_files import read_camera
 from nolbo_ppl.io.files import read_json_object, write_json
 from nolbo_ppl.io.images import images_of
@@ -141,6 +143,28 @@ class Photographs:
 
 
 @dataclass(frozen=True)
+class PseudoLabels:
+    """Photographs without labels, labelled by a model with its confidence, as scenes for `nolbo train`."""
+
+    images: Path
+    """Folder of photographs."""
+    out: Path
+    """Folder for images/, scenes.jsonl, source.json."""
+    model: str = "photo"
+    """Name of shipped weights, or a folder with a model."""
+    min_confidence: float = MIN_CONFIDENCE
+    """Least probability of an object that becomes a label."""
+    suspected: float = SUSPECTED
+    """From this probability on it is a region to ignore; what is less is background."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        images = sorted(images_of(self.images, recursive=True))
+        counts = write_pseudo_labels(images, load(self.model), self.out, self.min_confidence, self.suspected)
+        return f"{counts['images']} photographs, {counts['objects']} objects, {counts['ignore']} regions to ignore"
+
+
+@dataclass(frozen=True)
 class YcbvSlam:
     """YCB-Video SLAM: real 6D detections with heavy tails, real odometry with added drift."""
 
@@ -224,6 +248,7 @@ Source = (
     | Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
     | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
     | Annotated[Photographs, tyro.conf.subcommand("photographs")]
+    | Annotated[PseudoLabels, tyro.conf.subcommand("pseudo-labels")]
     | Annotated[YcbvSlam, tyro.conf.subcommand("ycbv-slam")]
     | Annotated[Pascal3d, tyro.conf.subcommand("pascal3d")]
     | Annotated[ObjectNet3d, tyro.conf.subcommand("objectnet3d")]

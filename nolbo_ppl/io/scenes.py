@@ -3,9 +3,10 @@
 A line is `{"image": "images/000000.png", "intrinsics": [fx, fy, cx, cy], "objects": [...]}`; an object is
 `{"box": [x0, y0, x1, y1] px, "category", "instance", "rotation": [qx, qy, qz, qw] of R_camera_object, "position":
 [x, y, z] m of the box centre in the camera frame, "size": m (box diagonal), "dimensions": [3] m, "visibility",
-"symmetry"}`. A line may have `"ignore"`, boxes of parts of the image that are
-not labelled, and `"exhaustive"`, the categories of which every instance is labelled (all of them when it is missing). Only
-`image`, `intrinsics`, `objects` and each object's `box` are required: what is missing is unlabelled.
+"symmetry", "confidence", "category_confidence"}`, the last two of labels that a model gave: probabilities that the object is
+there and that its category is right. A line may have `"ignore"`, boxes of parts of the image that are not labelled, and
+`"exhaustive"`, the categories of which every instance is labelled (all of them when it is missing). Only `image`, `intrinsics`,
+`objects` and each object's `box` are required: what is missing is unlabelled.
 """
 
 from __future__ import annotations
@@ -118,8 +119,15 @@ def _parse_object(
     symmetry = row["symmetry"] if "symmetry" in known else symmetries.get(category or "", 1)
     if isinstance(symmetry, bool) or not isinstance(symmetry, int) or symmetry < 0:
         raise at.error(f"{where}symmetry", symmetry, "0 (free about the vertical axis), 1 (none) or n (n-fold)")
+    sure: dict[str, float | None] = {}
+    for field in ("confidence", "category_confidence"):
+        sure[field] = at.number(row, field, where, "a probability above 0") if field in known else None
+        value = sure[field]
+        if value is not None and not 0 < value <= 1:
+            raise at.error(f"{where}{field}", value, "a probability above 0, at most 1")
     name = row["id"] if "id" in known else None
     return {
+        **sure,
         "box": box,
         "category": category,
         "instance": instance,
@@ -173,7 +181,7 @@ def parse_record(
         raise at.error("exhaustive", exhaustive, "a list of categories among " + ", ".join(categories))
     ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
     columns = ("box", "category", "instance", "id", "R_camera_object", "position", "diagonal", "dimensions")
-    columns += ("visibility", "symmetry")
+    columns += ("visibility", "symmetry", "confidence", "category_confidence")
     values: dict[str, Any] = {name: [thing[name] for thing in parsed] for name in columns}
     return Annotations.from_arrays(intrinsics, **values, ignore=ignore, exhaustive=exhaustive, file=image)
 
@@ -201,6 +209,9 @@ def annotations_record(scene: Annotations, image: str) -> dict[str, Any]:
             row["size"] = round(float(scene.diagonal[k]), 6)
         if np.isfinite(scene.dimensions[k]).all():
             row["dimensions"] = rounded(scene.dimensions[k])
+        for field in ("confidence", "category_confidence"):
+            values = getattr(scene, field)
+            row[field] = None if values is None else round(float(values[k]), 6)
         row |= {"visibility": round(float(scene.visibility[k]), 6), "symmetry": int(scene.symmetry[k]), "id": scene.id[k]}
         objects.append({name: value for name, value in row.items() if value is not None})
     line: dict[str, Any] = {"image": image, "intrinsics": rounded(scene.intrinsics), "objects": objects}

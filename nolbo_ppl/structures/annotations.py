@@ -62,6 +62,10 @@ class Annotations:
     judged."""
     exhaustive: tuple[str, ...] | None = None
     """Categories of which every instance is labelled; None for all of them."""
+    confidence: Float[np.ndarray, " m"] | None = None
+    """Probability that each object is there, of labels that a model gave; None: they are certain."""
+    category_confidence: Float[np.ndarray, " m"] | None = None
+    """Probability that each one's category is right; None: they are certain."""
     voxels: UInt8[np.ndarray, "m bytes"] | None = None
     """Canonical grids, packed bits in C order, all zero where one is unknown; None where nobody looked them up."""
     file: Path | None = None
@@ -99,7 +103,10 @@ class Annotations:
         index = np.arange(len(self))[rows]
         chosen: dict[str, Any] = {name: getattr(self, name)[index] for name in ARRAYS}
         chosen |= {name: tuple(getattr(self, name)[i] for i in index) for name in ("category", "instance", "id")}
-        return replace(self, **chosen, voxels=None if self.voxels is None else self.voxels[index])
+        for name in ("confidence", "category_confidence", "voxels"):
+            value = getattr(self, name)
+            chosen[name] = None if value is None else value[index]
+        return replace(self, **chosen)
 
     @classmethod
     def from_arrays(
@@ -118,6 +125,8 @@ class Annotations:
         symmetry: Any = None,
         ignore: Any = None,
         exhaustive: Sequence[str] | None = None,
+        confidence: Any = None,
+        category_confidence: Any = None,
         voxels: UInt8[np.ndarray, "m bytes"] | None = None,
         file: Path | None = None,
         pixels: UInt8[np.ndarray, "h w 3"] | None = None,
@@ -135,6 +144,8 @@ class Annotations:
             visibility: [m], 1 by default.
             symmetry: [m], 1 by default.
             ignore: [k, 4] px.
+            confidence: [m] probabilities; where all are None or missing, labels are certain.
+            category_confidence: the same of the categories.
 
         Raises:
             InputError: lengths do not match.
@@ -156,6 +167,10 @@ class Annotations:
                 raise input_error(f"{name} of labelled objects", got=len(found), expected=m)
             return found
 
+        def unsure(values: Any, name: str) -> np.ndarray | None:
+            some = values is not None and any(value is not None for value in values)
+            return full(values, (), name, 1.0) if some else None
+
         sides = full(dimensions, (3,), "dimensions", np.nan)
         diagonals = full(diagonal, (), "diagonal", np.nan)
         if voxels is not None and len(voxels) != m:
@@ -174,6 +189,8 @@ class Annotations:
             symmetry=full(symmetry, (), "symmetry", 1.0).astype(np.int64),
             ignore=np.zeros((0, 4)) if ignore is None else np.asarray(ignore, dtype=np.float64).reshape(-1, 4),
             exhaustive=None if exhaustive is None else tuple(exhaustive),
+            confidence=unsure(confidence, "confidence"),
+            category_confidence=unsure(category_confidence, "category_confidence"),
             voxels=voxels,
             file=file,
             pixels=pixels,

@@ -21,6 +21,8 @@ SLOTS = 8
 """Default number of object slots an image."""
 
 Arrays = dict[str, np.ndarray]
+CERTAINTY = ("confidence", "category_confidence")
+"""Probabilities that labels of a model are right; loaders draw from them (`nolbo_ppl.training.scene_loader.drawn_labels`)."""
 
 _LAYOUT: dict[str, tuple[tuple[int, ...], type, float]] = {
     "present": ((), np.bool_, 0),
@@ -94,7 +96,7 @@ def fill_annotations(
 def fill_regions(
     arrays: Arrays, scenes: Sequence[Annotations], categories: Sequence[str], placings: Sequence[tuple[float, float, float]]
 ) -> None:
-    """Add `ignore` and `exhaustive`, what is not labelled, where any of the images says so."""
+    """Add `ignore` and `exhaustive`, what is not labelled, and how certain labels are, where any of the images says so."""
     if any(len(scene.ignore) for scene in scenes):
         arrays["ignore"] = np.zeros((len(scenes), max(len(scene.ignore) for scene in scenes), 4), dtype=np.float32)
         for row, (scene, (scale, left, top)) in enumerate(zip(scenes, placings)):
@@ -103,6 +105,13 @@ def fill_regions(
         arrays["exhaustive"] = np.array(
             [[scene.exhaustive is None or name in scene.exhaustive for name in categories] for scene in scenes]
         )
+    for field in CERTAINTY:
+        if any(getattr(scene, field) is not None for scene in scenes):
+            arrays[field] = np.ones(arrays["present"].shape, dtype=np.float32)
+            for row, scene in enumerate(scenes):
+                value = getattr(scene, field)
+                if value is not None:
+                    arrays[field][row, : len(value)] = value
 
 
 def allocentric_viewpoints(arrays: Arrays) -> Float[np.ndarray, "scenes slots 3"]:
@@ -132,7 +141,7 @@ def assemble(
     voxels: np.ndarray,
     has_voxels: Bool[np.ndarray, "scenes slots"],
 ) -> Arrays:
-    """The fields of `nolbo_ppl.models.scene_batch.SceneBatch` as arrays; `labels` includes `viewpoint`."""
+    """The fields of `nolbo_ppl.models.scene_batch.SceneBatch` as arrays, and `CERTAINTY`; `labels` includes `viewpoint`."""
     batch = {name: labels[name] for name in ("intrinsics", "viewpoint", *_LAYOUT) if name != "rotation"}
-    batch |= {name: labels[name] for name in ("ignore", "exhaustive") if name in labels}
+    batch |= {name: labels[name] for name in ("ignore", "exhaustive", *CERTAINTY) if name in labels}
     return {"image": images, **batch, "voxels": voxels, "has_voxels": has_voxels}

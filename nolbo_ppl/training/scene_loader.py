@@ -22,7 +22,7 @@ from nolbo_ppl.models.baselines.single_object import one_object_batch
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
-from nolbo_ppl.structures.label_arrays import Arrays
+from nolbo_ppl.structures.label_arrays import CERTAINTY, Arrays
 from nolbo_ppl.synthetic.assets.shape_library import VOXELS
 from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
 
@@ -35,6 +35,25 @@ BOX_JITTER = 0.08
 def to_batch(arrays: Arrays) -> SceneBatch:
     """Arrays of a loader as the batch that story and guide take."""
     return SceneBatch(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()})
+
+
+def drawn_labels(arrays: Arrays, draws: Float[np.ndarray, "2 b m"] | None = None) -> Arrays:
+    """Labels of a model as certain ones: objects and categories kept with their probabilities.
+
+    An object that is not kept is background, a category that is not kept is missing; the mean over many draws is the objective
+    of soft labels, with every site and no other bound.
+
+    Args:
+        arrays: of a loader, perhaps with `confidence` and `category_confidence`.
+        draws: uniform numbers for objects and categories; without them what is likelier than not is kept.
+    """
+    rest = {name: value for name, value in arrays.items() if name not in CERTAINTY}
+    level = np.full((2, *arrays["present"].shape), 0.5) if draws is None else draws
+    if CERTAINTY[0] in arrays:
+        rest["present"] = arrays["present"] & (arrays[CERTAINTY[0]] >= level[0])
+    if CERTAINTY[1] in arrays:
+        rest["category"] = np.where(arrays[CERTAINTY[1]] >= level[1], arrays["category"], -1)
+    return rest
 
 
 class SceneSubset:
@@ -222,7 +241,7 @@ class SceneLoader:
         if self.augmentation is not None and self.augmentation.mirror_probability > 0:
             drawn = np.random.default_rng([self.seed, step, 2]).random(self.batch_size)[self.part]
             mirrored = torch.from_numpy(drawn < self.augmentation.mirror_probability)
-        batch = self._labelled(index, mirrored)
+        batch = self._labelled(index, mirrored, np.random.default_rng([self.seed, step, 3]))
         size = int(generator.choice(self.sizes)) if self.sizes else self._other(batch)
         if self.augmentation is not None or size is not None:
             seeds = generator.integers(2**63, size=self.batch_size)[self.part]
@@ -246,9 +265,15 @@ class SceneLoader:
         """The side images are brought to, or None where they have it."""
         return None if self.size is None or self.size == max(batch.image.shape[-2:]) else self.size
 
-    def _labelled(self, index: Int[np.ndarray, " b"], mirrored: Bool[Tensor, " b"] | None = None) -> SceneBatch:
-        """Scenes of these numbers as they are, or mirrored, with the teacher's latents."""
-        batch = self.table.add_shape_targets(to_batch(self.scenes.batch(index)), mirrored)
+    def _labelled(
+        self, index: Int[np.ndarray, " b"], mirrored: Bool[Tensor, " b"] | None = None, rng: np.random.Generator | None = None
+    ) -> SceneBatch:
+        """Scenes of these numbers as they are, or mirrored, with the teacher's latents; labels of models drawn by `rng`."""
+        arrays = self.scenes.batch(index)
+        draws = None
+        if rng is not None and not {*CERTAINTY}.isdisjoint(arrays):
+            draws = rng.random((2, self.batch_size, arrays["present"].shape[1]))[:, self.part]
+        batch = self.table.add_shape_targets(to_batch(drawn_labels(arrays, draws)), mirrored)
         if mirrored is not None:
             batch = mirror(batch, mirrored)
         return batch.replace(instance=torch.where(batch.instance < self.known, batch.instance, -1))
