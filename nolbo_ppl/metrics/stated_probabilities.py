@@ -19,6 +19,8 @@ from nolbo_ppl.metrics.calibration import BINS, expected_calibration_error
 
 LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
 """Levels of regions whose coverage is reported."""
+Outcomes = Bool[np.ndarray, " n"] | Float[np.ndarray, " n"]
+"""Whether each thing happened, or 1 and 0."""
 MIN_IN_BIN = 50
 """Bins of a reliability table with fewer cases are joined to the next."""
 LIMIT = 1e-6
@@ -46,7 +48,7 @@ def _checked(stated: np.ndarray, happened: np.ndarray) -> tuple[np.ndarray, np.n
     return stated, happened
 
 
-def log_score(stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"]) -> float:
+def log_score(stated: Float[np.ndarray, " n"], happened: Outcomes) -> float:
     """Mean negative log probability of what happened, nats; less is better.
 
     Raises:
@@ -62,7 +64,7 @@ def log_score(stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"])
 
 
 def reliability_bins(
-    stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"], bins: int = 10, least: int = MIN_IN_BIN
+    stated: Float[np.ndarray, " n"], happened: Outcomes, bins: int = 10, least: int = MIN_IN_BIN
 ) -> tuple[ReliabilityBin, ...]:
     """Bins of equal width, those of fewer than `least` cases joined to the next; the last ones alone where they are all there is.
 
@@ -123,7 +125,7 @@ def debiased_calibration_error(confidence: Float[np.ndarray, " n"], outcome: Boo
     return float(np.sqrt(max(np.sum((count * square)[use]) / total, 0.0))) if total else float("nan")
 
 
-def probability_record(stated: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"]) -> dict[str, Any]:
+def probability_record(stated: Float[np.ndarray, " n"], happened: Outcomes) -> dict[str, Any]:
     """All of this for one kind of probability, as JSON holds it.
 
     Example:
