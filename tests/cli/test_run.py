@@ -59,7 +59,7 @@ def config_of(drive: SimulatedDrive, out: Path, **change: Any) -> RunConfig:  # 
 def known(drive: SimulatedDrive) -> Iterator[SimulatedDrive]:  # noqa: F811
     """Every model name loads the one that knows the drive."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load", lambda name: drive.model)
+        patch.setattr(pipeline, "load", lambda name, device: drive.model)
         yield drive
 
 
