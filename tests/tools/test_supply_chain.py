@@ -60,3 +60,12 @@ def test_the_bill_names_all_that_is_needed_and_the_weights(tmp_path: Path) -> No
         assert {link["ref"], *link["dependsOn"]} <= known
     direct = next(link for link in bill["dependencies"] if link["ref"] == own["bom-ref"])["dependsOn"]
     assert len(direct) == len([text for text in metadata.requires("nolbo-ppl") or () if "extra" not in text])
+
+
+def test_shapes_are_text() -> None:
+    """jaxtyping 0.3.0, the lowest version allowed, knows no bare ellipsis."""
+    bare = re.compile(r"\b(?:Float|Int|Bool|UInt8|Shaped|Num)\[[^\[\]\"]*, \.\.\.\]")
+    assert bare.search("Float[np.ndarray, ...]") and not bare.search('Float[np.ndarray, "..."]')
+    files = sorted((ROOT / "nolbo_ppl").rglob("*.py"))
+    assert len(files) > 100
+    assert [str(file) for file in files if bare.search(file.read_text(encoding="utf-8"))] == []
