@@ -31,7 +31,7 @@ def is_whole(value: object, low: int = 0, high: int = 2**31 - 1) -> TypeGuard[in
     return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
 
 
-def number_array(value: Any, shape: tuple[int | None, ...], largest: float = LARGEST) -> Float[np.ndarray, "..."] | None:
+def number_array(value: Any, shape: tuple[int | None, ...], largest: float = LARGEST) -> Float[np.ndarray, " ..."] | None:
     """Nested lists of finite numbers as a float64 array; None where they are anything else.
 
     `numpy.asarray` alone takes true for 1 and "2" for 2.

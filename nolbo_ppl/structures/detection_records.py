@@ -95,7 +95,7 @@ def _record(d: Detections, i: int, quaternion: np.ndarray, mode_quaternion: np.n
     return row
 
 
-def significant(values: Float[np.ndarray, "..."], digits: int = 7) -> Float[np.ndarray, "..."]:
+def significant(values: Float[np.ndarray, " ..."], digits: int = 7) -> Float[np.ndarray, " ..."]:
     """Numbers rounded to some significant digits: those of single precision are seven."""
     values = np.asarray(values, dtype=np.float64)
     rounded = [float(f"{value:.{digits - 1}e}") for value in values.ravel().tolist()]

@@ -187,7 +187,7 @@ def latent_width(state: SlamState) -> float:
     return robust_scale(((latent - (total / precision)[track]) / scale / np.sqrt(np.maximum(left, 1e-9))).ravel())
 
 
-def _width(residual: Float[np.ndarray, "..."], expected: Float[np.ndarray, "..."]) -> float:
+def _width(residual: Float[np.ndarray, " ..."], expected: Float[np.ndarray, " ..."]) -> float:
     return robust_width(residual.ravel(), expected.reshape(residual.size, -1))
 
 
