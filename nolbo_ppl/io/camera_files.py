@@ -65,7 +65,7 @@ class CameraIntrinsics:
     @property
     def vector(self) -> Float[np.ndarray, " 4"]:
         """[fx, fy, cx, cy] in px."""
-        return np.array([self.fx, self.fy, self.cx, self.cy])
+        return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
 
     def as_dict(self) -> dict[str, Any]:
         """What `intrinsics.json` holds."""

@@ -63,7 +63,7 @@ def _flag(element: ElementTree.Element, path: str) -> bool:
 
 
 def read_voc_annotation(
-    path: str | PathLike[str], images: str | PathLike[str], categories: Collection[str] = CATEGORIES
+    path: str | PathLike[str], images: str | PathLike[str] | None, categories: Collection[str] = CATEGORIES
 ) -> ArchiveImage:
     """The labels of one XML file; objects of other categories are left out.
 
@@ -72,7 +72,7 @@ def read_voc_annotation(
 
     Args:
         path: the XML file.
-        images: folder of the images.
+        images: folder of the images; None: the labels alone, wherever the image is.
         categories: names the labels stand for.
 
     Raises:
@@ -83,8 +83,8 @@ def read_voc_annotation(
     name = root.findtext("filename")
     if not name:
         raise input_error("filename", got=repr(name), expected="the name of the image", file=file)
-    image = Path(images) / Path(name).name
-    if not image.is_file():
+    image = Path(file.parent if images is None else images) / Path(name).name
+    if images is not None and not image.is_file():
         raise input_error("image of the annotation", got=name, expected=f"a file in {images}", file=file)
     size = (int(_number(root, "size/width", "", file)), int(_number(root, "size/height", "", file)))
     objects = []

@@ -1,0 +1,153 @@
+"""Labelled archives for `nolbo data check`: what each holds, as its converter reads it.
+
+A new archive needs one line: `labelled(name, what, looks_like, read)` with a reader that yields `ArchiveImage`s.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nolbo_ppl.categories import CATEGORIES
+from nolbo_ppl.data.converters.archives import ArchiveImage
+from nolbo_ppl.data.converters.pascal3d import read_objectnet3d, read_pascal3d, read_record
+from nolbo_ppl.data.converters.voc import read_voc, read_voc_annotation
+from nolbo_ppl.data.format_registry import LIKELY, SURE, FormatReport, LabelledPicture, Look, register
+from nolbo_ppl.errors import InputError, input_error
+from nolbo_ppl.geometry.masks import mask_moments
+from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.images import open_image
+
+SHOWN = 12
+"""Pictures of a contact sheet."""
+
+
+def labelled(name: str, what: str, looks_like: Callable[[Look], float], read: Callable[[Path], Iterable[ArchiveImage]]) -> None:
+    """Register an archive of labelled images by its reader."""
+
+    def report(path: Path) -> FormatReport:
+        return images_report(name, what, list(read(path)))
+
+    register(name, what, looks_like)(report)
+
+
+def images_report(name: str, what: str, images: list[ArchiveImage]) -> FormatReport:
+    """Counts, sizes and problems of labelled images."""
+    things = [(image, thing) for image in images for thing in image.objects]
+    facts: dict[str, Any] = {"images": len(images), "objects": len(things)}
+    facts["categories"] = dict(Counter(thing.category for _, thing in things).most_common())
+    for flag in ("difficult", "truncated", "occluded"):
+        count = sum(bool(getattr(thing, flag)) for _, thing in things)
+        facts |= {flag: count} if count else {}
+    facts["viewpoints"] = sum(thing.viewpoint is not None for _, thing in things)
+    facts["instances"] = len({thing.instance for _, thing in things} - {None})
+    missing = [image.path for image in images if not image.path.is_file()]
+    outside = sum(
+        min(thing.box[:2]) < -1 or thing.box[2] > image.size[0] + 1 or thing.box[3] > image.size[1] + 1 for image, thing in things
+    )
+    problems = [f"{len(missing)} images are not there, the first {missing[0]}"] if missing else []
+    problems += [f"{outside} boxes stick out of their images"] if outside else []
+
+    def pictures() -> Iterator[LabelledPicture]:
+        shown = [image for image in images if image.path.is_file()]
+        for k in np.unique(np.linspace(0, len(shown) - 1, min(len(shown), SHOWN)).round().astype(int)) if shown else []:
+            one = shown[k]
+            boxes = np.array([thing.box for thing in one.objects], dtype=np.float64).reshape(-1, 4)
+            yield LabelledPicture(one.path.name, open_image(one.path), boxes, tuple(thing.category for thing in one.objects))
+
+    return FormatReport(name, what, facts, tuple(problems), pictures=pictures)
+
+
+labelled(
+    "pascal3d",
+    "PASCAL3D+ 1.1",
+    lambda look: SURE if {"Annotations", "Images", "CAD"} <= look.names and "PASCAL" in look.names else 0.0,
+    lambda path: read_pascal3d(path, None),
+)
+labelled(
+    "objectnet3d",
+    "ObjectNet3D",
+    lambda look: LIKELY if {"Annotations", "Images", "Image_sets"} <= look.names and "PASCAL" not in look.names else 0.0,
+    lambda path: read_objectnet3d(path, None),
+)
+labelled(
+    "voc",
+    "PASCAL VOC",
+    lambda look: SURE if {"Annotations", "JPEGImages"} <= look.names else 0.0,
+    lambda path: read_voc(path),
+)
+
+
+def _xml_folder(look: Look) -> float:
+    xml = sorted(name for name in look.names if name.endswith(".xml"))
+    return LIKELY if xml and 2 * len(xml) >= len(look.names) and "<annotation" in Look(look.path / xml[0]).text else 0.0
+
+
+@register("voc-annotations", "annotation files of PASCAL VOC", _xml_folder)
+def report_voc_annotations(path: Path) -> FormatReport:
+    """A folder of XML files without their images."""
+    images, problems = [], []
+    for file in sorted(path.glob("*.xml")):
+        try:
+            images.append(read_voc_annotation(file, None))
+        except InputError as error:
+            problems.append(str(error))
+    report = images_report("voc-annotations", "annotation files of PASCAL VOC", images)
+    kept = [text for text in report.problems if "are not there" not in text]
+    return FormatReport(report.format, report.what, report.facts, (*kept, *problems[:20]))
+
+
+def _coco(look: Look) -> float:
+    start = look.text.lstrip()
+    named = any(f'"{word}"' in start for word in ("images", "annotations", "categories", "licenses", "info"))
+    return LIKELY if look.suffix == ".json" and start.startswith("{") and named else 0.0
+
+
+@register("coco", "MS-COCO instances", _coco)
+def report_coco(path: Path) -> FormatReport:
+    """Images, objects by category, masks; the categories of the library among them."""
+    content = read_json(path)
+    if not isinstance(content, dict) or not isinstance(content.get("annotations"), list) or "images" not in content:
+        raise input_error("not a COCO file of instances", expected='{"images": [], "annotations": [], ...}', file=path)
+    names = {row["id"]: str(row["name"]) for row in content.get("categories", [])}
+    rows = content["annotations"]
+    facts: dict[str, Any] = {"images": len(content["images"]), "objects": len(rows)}
+    facts["categories"] = dict(Counter(names.get(row.get("category_id"), "?") for row in rows).most_common())
+    facts["crowds"] = sum(bool(row.get("iscrowd")) for row in rows)
+    facts["of_the_library"] = sorted(set(facts["categories"]) & set(CATEGORIES))
+    problems, masks = [], 0
+    known = {image["id"]: image for image in content["images"]}
+    for row in rows:
+        if row.get("image_id") not in known:
+            problems.append(f"annotation {row.get('id')} is of an image that is not listed")
+        box = row.get("bbox")
+        if not (isinstance(box, list) and len(box) == 4 and box[2] > 0 and box[3] > 0):
+            problems.append(f"annotation {row.get('id')}: box {box}")
+        try:
+            masks += mask_moments(row["segmentation"]) is not None if row.get("segmentation") else 0
+        except InputError as error:
+            problems.append(f"annotation {row.get('id')}: {error}")
+    facts["masks"] = masks
+    return FormatReport("coco", "MS-COCO instances", facts, tuple(problems[:20]))
+
+
+@register(
+    "matlab-annotations",
+    "annotations in a MATLAB file",
+    lambda look: LIKELY if look.suffix == ".mat" and look.head[:6] == b"MATLAB" else 0.0,
+)
+def report_matlab(path: Path) -> FormatReport:
+    """Stanford Cars' list, or one image of PASCAL3D+ or ObjectNet3D."""
+    try:
+        rows = np.atleast_1d(read_record(path, "annotations"))
+    except InputError:
+        record = read_record(path)
+        objects = np.atleast_1d(getattr(record, "objects", []))
+        facts: dict[str, Any] = {"image": str(getattr(record, "filename", "")), "objects": len(objects)}
+        facts["categories"] = dict(Counter(str(getattr(one, "class_", getattr(one, "class", "?"))) for one in objects))
+        return FormatReport("pascal3d-annotation", "one image of PASCAL3D+ or ObjectNet3D", facts)
+    return FormatReport("stanford-cars", "Stanford Cars", {"images": len(rows), "fields": sorted(rows[0]._fieldnames)})
