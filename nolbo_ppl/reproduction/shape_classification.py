@@ -92,7 +92,7 @@ def augmented(voxels: Bool[Tensor, "n v v v"], shift: int, generator: torch.Gene
         for row, by in enumerate(offset):
             to = tuple(slice(max(b, 0), out.shape[1] + min(b, 0)) for b in by)
             of = tuple(slice(max(-b, 0), out.shape[1] + min(-b, 0)) for b in by)
-            moved[(row, *to)] = out[(row, *of)]
+            moved[row][to] = out[row][of]
         out = moved
     return out
 

@@ -97,7 +97,7 @@ def render_drive(config: ReproduceConfig, name: str, path: Float[np.ndarray, "n 
             images.append(seen.rendered.image)
             frame += [k] * len(seen.ids)
             box += [label.box for label in seen.rendered.labels]
-            ids += [int(one.removeprefix("O")) for one in seen.ids]
+            ids += [int(str(one).removeprefix("O")) for one in seen.ids]
         arrays = {
             "T_world_camera": world.T_world_camera,
             "images": np.array(images),

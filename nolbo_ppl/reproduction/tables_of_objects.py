@@ -58,8 +58,8 @@ def viewpoint_table(config: ReproduceConfig) -> ResultTable:
         for measure, row in (("Acc", accuracy_row(found)), ("MedErr", median_row(found))):
             table.add(f"{NETWORKS[name].title}, here", [measure, *row])
     for measure, paper in (("Acc", ACCURACY), ("MedErr", MEDIAN_ERROR)):
-        for title, row in paper.items():
-            table.add(title, [measure, *row, round(float(np.mean(row)), 3)])
+        for title, numbers in paper.items():
+            table.add(title, [measure, *numbers, round(float(np.mean(numbers)), 3)])
     return table
 
 
@@ -123,7 +123,7 @@ def reconstruction(config: ReproduceConfig) -> tuple[ResultTable, dict[str, Prec
         "The paper shows a curve without numbers, of its 3D-VAE-GAN for bench, chair and sofa only. "
         f"Data: {config.data}, budget {config.budget}, {config.seeds} seeds.",
     )
-    curves = {}
+    curves: dict[str, PrecisionRecall] = {}
     some = [CATEGORIES.index(name) for name in OF_VAE_GAN]
     for name in config.chosen(tuple(NETWORKS)):
         figures = []

@@ -61,10 +61,15 @@ class AdversarialLoss(nn.Module):
         loss: loss of shapes or of scenes.
         model: the networks, with a discriminator.
         weights: weight of each of `ADVERSARIAL_TERMS`.
+
+    Raises:
+        InputError: the networks have no discriminator.
     """
 
     def __init__(self, loss: nn.Module, model: Nolbo, weights: Mapping[str, float]) -> None:
         super().__init__()
+        if model.discriminator is None:
+            raise input_error("adversarial terms", got=f"method {model.config.method}", expected="a method with a discriminator")
         self.loss, self.discriminator, self.decoder = loss, model.discriminator, model.story.decoder
         self.weights, self.config = dict(weights), model.config
 

@@ -54,7 +54,7 @@ def draw_latent_maps(
             for one in shown:
                 of = label == one
                 colour = category_colour(categories[one], list(categories))
-                axes.scatter(*points[of].T, s=3, color=colour, linewidths=0, label=categories[one])
+                axes.scatter(points[of, 0], points[of, 1], s=3, color=colour, linewidths=0, label=categories[one])
             axes.set_title(name)
             plain(axes)
         handles, names = figure.axes[0].get_legend_handles_labels()

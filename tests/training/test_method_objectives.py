@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from nolbo_ppl.errors import InputError
@@ -24,7 +25,7 @@ from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.scene_batch import decode_range, encode_range, unpack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
-from nolbo_ppl.training.calibrate import about_mean
+from nolbo_ppl.training.calibrate import about_mean, calibrate
 from nolbo_ppl.training.detector_file import adopt_features
 from nolbo_ppl.training.method_objectives import AdversarialLoss, image_weights, shape_weights
 from nolbo_ppl.training.stages import OBJECTIVES, StageRun, TrainingStage, scene_weights
@@ -336,3 +337,29 @@ def test_options_of_methods() -> None:
         tiny_config(method="gan")
     with pytest.raises(InputError, match="method"):
         ModelConfig.from_json({"method": "gan"})
+
+
+@pytest.mark.parametrize("method", ALL)
+def test_every_method_is_calibrated(method: MethodName) -> None:
+    """Factors are found for each; where nothing but a shape's views says where its latent lies, by their scatter."""
+    config = tiny_config(method=method)
+    model = tiny_model(config, scatter=0.3)
+    batch = random_batch(config, 25, 3)
+    if METHODS[method].one_object:
+        batch = one_object_batch(random_batch(config, 60, 1), 64)
+    shape = torch.arange(batch.present.numel()).reshape(batch.present.shape) % 10
+    batch = batch.replace(shape_index=shape)
+    found = calibrate(model, [batch])
+    assert found.shape_scale > 0 and found.box_scale > 0
+    if METHODS[method].decoded:
+        with torch.no_grad():
+            scene = model.eval().guide.observe(batch)
+        q = scene.posterior.at_map_category(model.story.prior.label_mean())
+        mask = scene.assignment.assigned & batch.has_voxels
+        z = (q.shape_loc / q.shape_scale)[mask].detach()
+        scatter = torch.cat([z[shape[mask] == k] - z[shape[mask] == k].mean(0) for k in range(10)])
+        count = torch.cat([(shape[mask] == k).sum().repeat(int((shape[mask] == k).sum())) for k in range(10)])
+        squared = (scatter.square() * (count / (count - 1))[:, None]).sum(-1)
+        expected = float(torch.sqrt(torch.quantile(squared, 0.9) / chi2.ppf(0.9, config.latent_dim)))
+        assert found.shape_scale == pytest.approx(expected)
+        assert found.shape_correlation == 0.0

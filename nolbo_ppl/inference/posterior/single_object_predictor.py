@@ -20,7 +20,7 @@ from nolbo_ppl.inference.posterior.preprocess import Image, guessed_intrinsics, 
 from nolbo_ppl.models.baselines.single_object import crop_objects
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
-from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 
 class SingleObjectModel(ObservationModel):
@@ -137,7 +137,8 @@ class SingleObjectModel(ObservationModel):
 
 def _shape(image: Any) -> tuple[int, int]:
     """Height and width."""
-    return tuple(image.shape[-2:]) if isinstance(image, Tensor) else tuple(image.shape[:2])
+    height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
+    return int(height), int(width)
 
 
 def _joined(parts: Sequence[ObjectPosteriors]) -> ObjectPosteriors:
@@ -149,10 +150,9 @@ def _joined(parts: Sequence[ObjectPosteriors]) -> ObjectPosteriors:
         values = [getattr(part, field.name) for part in parts]
         if isinstance(values[0], np.ndarray):
             joined[field.name] = np.concatenate(values)
-        elif dataclasses.is_dataclass(values[0]):
-            kind = type(values[0])
-            names = [inner.name for inner in dataclasses.fields(kind)]
-            joined[field.name] = kind(*(np.concatenate([getattr(v, n) for v in values]) for n in names))
+        elif isinstance(values[0], ViewpointModes):
+            names = [inner.name for inner in dataclasses.fields(ViewpointModes)]
+            joined[field.name] = ViewpointModes(*(np.concatenate([getattr(v, n) for v in values]) for n in names))
         else:
             joined[field.name] = values[0]
     return ObjectPosteriors(**joined)
