@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -92,6 +92,9 @@ class ReproduceConfig:
     """Networks of each kind, trained and measured from so many seeds; intervals are over them."""
     networks: tuple[str, ...] = ()
     """Names of the networks to compare; all of them by default."""
+    weights: dict[str, str] = field(default_factory=dict)
+    """Weights to take in place of training a network: its name and a name of shipped weights or the folder of a model, as
+    `multi16 tiny`."""
     threads: int = 0
     """Threads of torch; 0 leaves torch's own choice."""
     workers: int = 1
@@ -100,7 +103,7 @@ class ReproduceConfig:
     def __post_init__(self) -> None:
         if self.seeds < 1 or self.workers < 1:
             raise input_error("seeds or workers", got=(self.seeds, self.workers), expected="at least 1")
-        unknown = sorted(set(self.networks) - set(NETWORKS))
+        unknown = sorted({*self.networks, *self.weights} - set(NETWORKS))
         if unknown:
             raise input_error("unknown networks", got=unknown, expected=f"some of {sorted(NETWORKS)}")
         if self.data != "generated" and not Path(self.data).is_dir():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nolbo_ppl.data.dataset_folder import SceneFolder
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
@@ -24,24 +25,21 @@ INITIAL = "tiny"
 """Shipped weights whose features all start from."""
 
 
-def scene_folders(config: ReproduceConfig) -> tuple[Path, Path | None]:
-    """Scenes to learn from and held-out ones; of a folder of data, itself and its last tenth (None)."""
+def scene_folder(config: ReproduceConfig, held_out: bool) -> Path:
+    """Scenes to learn from or held-out ones; a folder of data is both (its last tenth is held out)."""
     if config.folder is not None:
-        return config.folder, None
+        return config.folder
     sizes = config.sizes
-    folders = []
-    for name, seed, count in (("train", TRAIN_SEED, sizes.scenes), ("held_out", HELD_OUT_SEED, sizes.held_out)):
-        folder = config.out / "scenes" / config.budget / name
-        source = SceneGenerator(preset("standard" if config.budget != "smoke" else "easy", sizes.image_size), seed)
-        write_scenes(folder, source, count, config.workers)
-        folders.append(folder)
-    return folders[0], folders[1]
+    name, seed, count = ("held_out", HELD_OUT_SEED, sizes.held_out) if held_out else ("train", TRAIN_SEED, sizes.scenes)
+    folder = config.out / "scenes" / config.budget / name
+    source = SceneGenerator(preset("standard" if config.budget != "smoke" else "easy", sizes.image_size), seed)
+    write_scenes(folder, source, count, config.workers)
+    return folder
 
 
 def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
     """How a network is trained."""
     network, sizes = NETWORKS[name], config.sizes
-    train, held_out = scene_folders(config)
     return TrainConfig(
         out=config.out / "networks" / config.budget / f"{name}-{seed}",
         preset="tiny",
@@ -50,8 +48,8 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         initial=INITIAL,
         initial_part="features",
         freeze_encoder=True,
-        scenes=(train,),
-        validation=held_out,
+        scenes=(scene_folder(config, held_out=False),),
+        validation=None if config.folder is not None else scene_folder(config, held_out=True),
         image_size=sizes.image_size,
         seed=seed,
         shape_steps=sizes.shape_steps,
@@ -68,7 +66,17 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
 
 
 def trained(config: ReproduceConfig, name: str, seed: int) -> ObservationModel:
-    """A network, trained if it is not yet; NOLBO on single objects is shown the boxes of the scene network of the same seed."""
+    """A network, trained if it is not yet; NOLBO on single objects is shown the boxes of the scene network of the same seed.
+
+    Raises:
+        InputError: weights that are to be taken are those of another method.
+    """
+    if name in config.weights:
+        model = load(config.weights[name])
+        if model.config.method != NETWORKS[name].method:
+            got = f"weights of method {model.config.method}"
+            raise input_error(f"weights of {name}", got=got, expected=f"those of method {NETWORKS[name].method}")
+        return model
     training = training_of(config, name, seed)
     if not (training.out / "model" / "config.json").is_file():
         run(training)
@@ -80,10 +88,6 @@ def trained(config: ReproduceConfig, name: str, seed: int) -> ObservationModel:
 
 def held_out_scenes(config: ReproduceConfig, categories: Sequence[str], symmetry: Sequence[int]) -> FolderScenes:
     """The scenes to measure on: the held-out folder, or the last tenth of a folder of data."""
-    train, held_out = scene_folders(config)
-    size = config.sizes.image_size
-    if held_out is not None:
-        return FolderScenes(SceneFolder(held_out, categories, size=size, symmetry=symmetry), config.sizes.held_out)
-    folder = SceneFolder(train, categories, size=size, symmetry=symmetry)
-    first = len(folder) - max(1, len(folder) // 10)
+    folder = SceneFolder(scene_folder(config, held_out=True), categories, size=config.sizes.image_size, symmetry=symmetry)
+    first = 0 if config.folder is None else len(folder) - max(1, len(folder) // 10)
     return FolderScenes(folder, config.sizes.held_out, first)

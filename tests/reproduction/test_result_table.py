@@ -15,6 +15,7 @@ from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.reproduction.budgets import NETWORKS, ReproduceConfig
 from nolbo_ppl.reproduction.paper_numbers import ACCURACY, ATE, CATEGORIES, MEDIAN_ERROR, RPE
 from nolbo_ppl.reproduction.result_table import ResultTable, over_seeds
+from nolbo_ppl.reproduction.trained_networks import trained
 
 
 def test_intervals_over_seeds() -> None:
@@ -63,7 +64,12 @@ def test_options_of_reproductions(tmp_path: Path) -> None:
     for changes, message in (
         ({"seeds": 0}, "seeds"),
         ({"networks": ("gan",)}, "unknown networks"),
+        ({"weights": {"gan": "tiny"}}, "unknown networks"),
         ({"data": str(tmp_path / "none")}, "no such folder"),
     ):
         with pytest.raises(InputError, match=message):
             ReproduceConfig(tmp_path, **changes)  # type: ignore[arg-type]
+    assert trained(ReproduceConfig(tmp_path, weights={"multi16": "tiny"}), "multi16", 0).config.latent_dim == 16
+    with pytest.raises(InputError, match="weights of ae16: got weights of method nolbo, expected those of method ae"):
+        trained(ReproduceConfig(tmp_path, weights={"ae16": "tiny"}), "ae16", 0)
+    assert not list(tmp_path.iterdir())  # nothing was rendered or trained

@@ -296,6 +296,12 @@ def test_boxes_of_single_objects_are_those_of_the_image() -> None:
     np.testing.assert_allclose(answer.position, there.position, rtol=0.02, atol=0.02)
     (none,) = seen.observe_boxes([image], [80.0, 80.0, 48.0, 32.0], [np.zeros((0, 4))], decode=False)
     assert len(none) == 0
+    many = box + np.arange(6)[:, None]
+    (few,), (all_at_once,) = (
+        seen.observe_boxes([image], [80.0, 80.0, 48.0, 32.0], [many], decode=False, batch=batch) for batch in (1, 16)
+    )
+    np.testing.assert_allclose(few.latent, all_at_once.latent, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(few.viewpoint_modes.azimuth, all_at_once.viewpoint_modes.azimuth, rtol=1e-3, atol=1e-3)
 
 
 def test_scatter_about_the_mean_of_views() -> None:
