@@ -27,6 +27,8 @@ from nolbo_ppl.structures.annotations import Annotations
 
 LARGEST = 1e6
 """Largest number of a line: px, m or a share."""
+SMALLEST = 1e-6
+"""Least length and focal length, m and px: below, 32 bits and divisions by it make infinities."""
 NEAREST = 1e-3
 """Least distance of an object before the camera, m."""
 UNIT_TOLERANCE = 1e-3
@@ -106,12 +108,12 @@ def _parse_object(
             raise at.error(f"{where}position", position.tolist(), "a point before the camera (z > 0)")
     if "size" in known:
         size = at.number(row, "size", where, "the box diagonal in m, positive")
-        if size <= 0:
+        if size < SMALLEST:
             raise at.error(f"{where}size", size, "the box diagonal in m, positive")
     dimensions = None
     if "dimensions" in known:
         dimensions = at.numbers(row, "dimensions", where, 3, "three side lengths in m, positive")
-        if (dimensions <= 0).any():
+        if (dimensions < SMALLEST).any():
             raise at.error(f"{where}dimensions", dimensions.tolist(), "three side lengths in m, positive")
     visibility = at.number(row, "visibility", where, "a share from 0 to 1") if "visibility" in known else 1.0
     if not 0 <= visibility <= 1:
@@ -167,7 +169,7 @@ def parse_record(
     at = _Line(file, line)
     expected = "[fx, fy, cx, cy] in px, all positive"
     intrinsics = at.numbers(row, "intrinsics", "", 4, expected)
-    if (intrinsics <= 0).any():
+    if (intrinsics < SMALLEST).any():
         raise at.error("intrinsics", intrinsics.tolist(), expected)
     objects = row.get("objects")
     if not isinstance(objects, list):

@@ -171,6 +171,8 @@ def user(tmp_path: Path) -> Callable[..., Path]:
         (user_line(image="scenes.jsonl"), r"scenes.jsonl:2: image scenes.jsonl: not a readable image"),
         (user_line(intrinsics=[200, 210, 80]), r":2: intrinsics: got \[200, 210, 80\], expected \[fx, fy, cx, cy\]"),
         (user_line(intrinsics=[200, -210, 80, 50]), r":2: intrinsics: .*all positive"),
+        (user_line(intrinsics=[200, 1e-320, 80, 50]), r":2: intrinsics: .*all positive"),
+        (user_line(size=5e-324), r":2: objects\[0\].size: .*positive"),
         (user_line(intrinsics="f"), r":2: intrinsics: got f"),
         (user_line(objects={}), r":2: objects: got \{\}, expected a list of objects"),
         (user_line(objects=[7]), r":2: objects\[0\]: got 7"),
