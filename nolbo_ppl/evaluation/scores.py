@@ -1,6 +1,6 @@
 """The figures of merit of an observation model, with intervals, from per-object and per-detection records.
 
-Everything here takes arrays: what a model answered beside what was true. `nolbo_ppl.cli.evaluate` fills the records.
+Everything here takes arrays: what a model answered beside what was true (`nolbo_ppl.evaluation.model_evaluation` fills it).
 Means "over categories" give every category the same weight, as the paper's Table 1 does.
 """
 

@@ -148,7 +148,7 @@ def probability_record(stated: Float[np.ndarray, " n"], happened: Outcomes) -> d
         "gap": reliability_gap(bins),
         "calibration_error": float(expected_calibration_error(p, y > 0.5)[0]),
         "calibration_error_if_perfect": float(null.mean()),
-        "debiased_error": debiased_calibration_error(p, y),
+        "debiased_error": debiased_calibration_error(p, y > 0.5),
         "bins": [[b.stated, b.happened, b.count] for b in bins],
     }
 

@@ -100,7 +100,7 @@ def write_page(values: Mapping[str, Any], pictures: Sequence[Path], path: str | 
     """Write the page.
 
     Args:
-        values: the content of metrics.json (`nolbo_ppl.cli.evaluate.metrics`).
+        values: the content of metrics.json (`nolbo_ppl.evaluation.model_evaluation.metrics`).
         pictures: PNG files, put into the page itself.
         path: where it goes.
     """
