@@ -95,6 +95,8 @@ class ReproduceConfig:
     weights: dict[str, str] = field(default_factory=dict)
     """Weights to take in place of training a network: its name and a name of shipped weights or the folder of a model, as
     `multi16 tiny`."""
+    device: str = "auto"
+    """Where networks train and observe: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
     threads: int = 0
     """Threads of torch; 0 leaves torch's own choice."""
     workers: int = 1

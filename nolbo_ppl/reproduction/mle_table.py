@@ -46,7 +46,9 @@ def shapes_of(config: ReproduceConfig) -> VoxelArchive:
 def scores_of_seed(config: ReproduceConfig, archive: VoxelArchive, seed: int, checkpoint: Path) -> ShapeScores:
     """Train on one split and score what was held out of it."""
     train, test = stratified_split(archive.category, HELD_OUT, seed)
-    model = fit_shape_vae(archive.select(train), ShapeVaeConfig(steps=config.sizes.shape_vae_steps, seed=seed), checkpoint)
+    model = fit_shape_vae(
+        archive.select(train), ShapeVaeConfig(steps=config.sizes.shape_vae_steps, seed=seed), checkpoint, device=config.device
+    )
     return score_shapes(model, archive.select(test))
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from nolbo_ppl.data.loader import batch_indices
 from nolbo_ppl.data.voxel_archive import VoxelArchive
+from nolbo_ppl.devices import device_of, placed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import svi as optimisation
 from nolbo_ppl.inference.elbo import SHAPE_STAGE
@@ -63,7 +64,7 @@ class ShapeVaeConfig:
 
     def model(self, names: tuple[str, ...]) -> ModelConfig:
         """The networks: shape networks of `tiny`, and the smallest image encoder, which is not trained."""
-        shapes = tiny() if self.initial is None else load(self.initial).config
+        shapes = tiny() if self.initial is None else load(self.initial, "cpu").config
         return dataclasses.replace(
             nano(),
             categories=names,
@@ -102,6 +103,7 @@ def fit_shape_vae(
     config: ShapeVaeConfig,
     checkpoint: Path | None = None,
     report: Callable[[optimisation.StepInfo], None] | None = None,
+    device: str = "cpu",
 ) -> Nolbo:
     """Train the shape autoencoder; a killed run goes on from its checkpoint, bit for bit.
 
@@ -110,6 +112,7 @@ def fit_shape_vae(
         config: networks and optimisation.
         checkpoint: file to keep the state in and to go on from.
         report: called after each step.
+        device: where to train; the networks come back to the CPU.
 
     Raises:
         InputError: no shapes, or the checkpoint belongs to another configuration.
@@ -118,8 +121,9 @@ def fit_shape_vae(
         raise input_error("no shapes to learn")
     model = Nolbo.from_seed(config.model(archive.names), config.seed)
     if config.initial is not None:
-        adopt_features(model, load(config.initial).model, SHAPE_FEATURES)
-    model = model.to(torch.get_default_dtype())
+        adopt_features(model, load(config.initial, "cpu").model, SHAPE_FEATURES)
+    where = device_of(device)
+    model = model.to(where, torch.get_default_dtype())
     schedule = OptimizerConfig(config.steps, config.learning_rate, warmup=min(50, config.steps), clip=5000.0, ema=0.99)
     run = StageRun(model, TrainingStage("shapes", schedule, SHAPE_STAGE, decode=config.decode), config.half_precision)
     identity = {**dataclasses.asdict(config), "shapes": len(archive)}
@@ -138,7 +142,8 @@ def fit_shape_vae(
             generator = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
             shapes = augmented(voxels[index], config.shift, generator)
             noise = seeded_noise(config.seed, step, len(index), config.latent_dim).to(torch.get_default_dtype())
-            info = run.step(ShapeBatch(pack_bits(shapes), category[index], torch.full((len(index),), -1), noise))
+            batch = ShapeBatch(pack_bits(shapes), category[index], torch.full((len(index),), -1), noise)
+            info = run.step(placed(batch, where))
             bar.update()
             if report is not None:
                 report(info)
@@ -146,7 +151,7 @@ def fit_shape_vae(
                 save_tensors(checkpoint, optimisation.state_tensors(run.state), {"identity": identity, "step": run.state.step})
     run.load_ema()
     model.set_half_precision(False)
-    return model.eval().requires_grad_(False)
+    return model.cpu().eval().requires_grad_(False)
 
 
 @dataclass(frozen=True)

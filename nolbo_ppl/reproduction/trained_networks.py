@@ -60,6 +60,7 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         evaluate_every=10**6,
         evaluate_scenes=64,
         checkpoint_every=20,
+        device=config.device,
         threads=config.threads,
         workers=config.workers,
     )
@@ -72,7 +73,7 @@ def trained(config: ReproduceConfig, name: str, seed: int) -> ObservationModel:
         InputError: weights that are to be taken are those of another method.
     """
     if name in config.weights:
-        model = load(config.weights[name])
+        model = load(config.weights[name], config.device)
         if model.config.method != NETWORKS[name].method:
             got = f"weights of method {model.config.method}"
             raise input_error(f"weights of {name}", got=got, expected=f"those of method {NETWORKS[name].method}")
@@ -80,7 +81,7 @@ def trained(config: ReproduceConfig, name: str, seed: int) -> ObservationModel:
     training = training_of(config, name, seed)
     if not (training.out / "model" / "config.json").is_file():
         run(training)
-    model = load(training.out / "model")
+    model = load(training.out / "model", config.device)
     if METHODS[NETWORKS[name].method].one_object:
         return SingleObjectModel(model.model, model.calibration, trained(config, "multi16", seed))
     return model
