@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -71,8 +71,8 @@ class Arguments:
     """Names of drives to run; all when empty."""
     every: int = 1
     """Use every so many-th image."""
-    usual_heights: bool = True
-    """Refine positions by the usual heights of categories."""
+    usual_heights: Literal["auto", "on", "off"] = "auto"
+    """Refine positions by the usual heights of categories; `auto`: with the weights `photo`."""
     sizes: tuple[int, ...] = (960,)
     """Longer sides, px, at which the street is looked at."""
 

@@ -119,7 +119,7 @@ class ObjectMappingPipeline:
             ask = partial(self.model.observe, size=config.test_sizes[0], **options)
         names, times = self.run.image_names, [row.get("time") for row in self.run.frames]
         seen = observe_sequence(
-            ask, self.read, names, self.drive.intrinsics, self.depth_source(), config.batch, times, config.usual_heights
+            ask, self.read, names, self.drive.intrinsics, self.depth_source(), config.batch, times, config.refines_by_height
         )
         self.run.write_detections(seen)
 

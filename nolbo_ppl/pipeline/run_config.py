@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -91,9 +92,10 @@ class RunConfig:
     """Folder of the right images of a rectified stereo pair: refine positions, and give visual odometry metric steps."""
     baseline: float | None = field(default=None, metadata=affects("odometry"))
     """Distance of the two cameras, m."""
-    usual_heights: bool = field(default=False, metadata=affects("observe"))
-    """Real objects: refine positions by the usual heights of their categories (cars 1.5 m), where there is no depth. The shipped
-    weights know ranges from generated scenes; those of KITTI's cars are off by a quarter without this, by a twentieth with it."""
+    usual_heights: Literal["auto", "on", "off"] = field(default="auto", metadata=affects("observe"))
+    """Real objects: refine positions by the usual heights of their categories (cars 1.5 m), where there is no depth. The weights
+    `photo` know ranges from generated scenes; those of KITTI's cars are off by a quarter without this, by a twentieth with it,
+    and the same error in all views of a car bends the trajectory. `auto`: for these weights alone."""
     mcap: bool = field(default=False, metadata=affects("map"))
     """Also write trajectory and map as map.mcap, for Foxglove and rviz (extra `ros`)."""
     report: bool = field(default=True, metadata=affects(None))
@@ -106,6 +108,11 @@ class RunConfig:
     """Settings of the visual odometry."""
     slam: SlamConfig = field(default_factory=SlamConfig, metadata=affects("slam"))
     """Settings of the EM."""
+
+    @property
+    def refines_by_height(self) -> bool:
+        """Whether usual heights refine positions."""
+        return self.usual_heights == "on" or (self.usual_heights == "auto" and self.model == "photo")
 
     def __post_init__(self) -> None:
         if self.scale_drift and not self.slam.scale_drift:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.geometry.pose import so3_exp
+from nolbo_ppl.pipeline.run_config import RunConfig
 from nolbo_ppl.pipeline.size_refinement import USUAL_HEIGHTS, refine_by_height, usual_range
 
 CAMERA = np.array([720.0, 720.0, 620.0, 190.0])
@@ -90,3 +92,12 @@ def test_refined_positions_sizes_and_what_stays(monkeypatch: pytest.MonkeyPatch)
     gap = refined.position[used] - centre[used]
     square = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(refined.position_covariance[used]), gap)
     assert np.mean(square < 6.25) > 0.85
+
+
+def test_usual_heights_are_for_the_weights_of_photographs_unless_told() -> None:
+    made = {
+        (model, option): RunConfig(Path("images"), Path("out"), model=model, usual_heights=option).refines_by_height  # type: ignore[arg-type]
+        for model in ("tiny", "photo")
+        for option in ("auto", "on", "off")
+    }
+    assert [key for key, value in made.items() if value] == [("tiny", "on"), ("photo", "auto"), ("photo", "on")]
