@@ -24,6 +24,7 @@ from nolbo_ppl.io.npz import Npz
 from nolbo_ppl.io.observations import read_observations
 from nolbo_ppl.io.ros_bags import IMAGES, READ, Bag, looks_like_bag, split_topic
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
+from nolbo_ppl.io.trajectory_documents import is_colmap
 from nolbo_ppl.synthetic.assets.cad import load_mesh
 
 SHOWN = 12
@@ -146,6 +147,11 @@ def report_bag(path: Path) -> FormatReport:
 
 
 def _trajectory(look: Look) -> float:
+    if look.suffix == ".json":
+        nuscenes = all(f'"{name}"' in look.text for name in ("timestamp", "rotation", "translation"))
+        return LIKELY if nuscenes and look.text.lstrip().startswith("[") and "camera_intrinsic" not in look.text else 0.0
+    if look.suffix == ".txt" and is_colmap(look.text.splitlines()):
+        return SURE
     if look.suffix not in (".txt", ".csv", ".tum", ".kitti", ""):
         return 0.0
     if look.is_folder or not look.text:
@@ -178,7 +184,7 @@ def trajectory_facts(found: Trajectory) -> tuple[dict[str, Any], list[str]]:
     return facts, problems
 
 
-@register("trajectory", "a trajectory (KITTI, TUM, EuRoC, 4 x 4)", _trajectory)
+@register("trajectory", "a trajectory (KITTI, TUM, EuRoC, 4 x 4, COLMAP, nuScenes)", _trajectory)
 def report_trajectory(path: Path) -> FormatReport:
     """Rows, times, length."""
     found = read_trajectory(path, lost=True, repeated=True)

@@ -18,6 +18,7 @@ from nolbo_ppl.io.images import natural
 from nolbo_ppl.io.npz import read_npz
 from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.text import read_lines
+from nolbo_ppl.io.trajectory_documents import is_colmap, parse_colmap, parse_nuscenes
 from nolbo_ppl.io.trajectory_tables import TableFormat, parse_table
 
 TrajectoryFormat = Literal["kitti", "tum"]
@@ -61,6 +62,9 @@ def read_trajectory(
 ) -> Trajectory:
     """Read a trajectory: KITTI, TUM, EuRoC or TUM-VI, 4 x 4 matrices a row, in blocks, or in a folder of one file a frame.
 
+    COLMAP's `images.txt` is read in natural order of the images' names, its unit of length as it is; `ego_pose.json` of nuScenes
+    holds poses of the car's body, not of a camera: their fixed offset remains, as with EuRoC.
+
     Formats are told apart by the length of the rows, those with quaternions by the names of the header, or by commas and
     times in ns (see `nolbo_ppl.io.trajectory_tables`).
 
@@ -92,17 +96,35 @@ def read_trajectory(
         return _poses_of_bag(path, lost)
     if path.is_dir():
         return _folder_of_poses(path, lost)
-    found = parse_table(path, read_lines(path), form, lost=lost)
+    if form == "nuscenes" or (form is None and path.suffix.lower() == ".json"):
+        document = parse_nuscenes(path)
+        return _in_time(path, document.T_world_camera, document.times, None, repeated)
+    lines = read_lines(path)
+    if form == "colmap" or (form is None and is_colmap(lines)):
+        return Trajectory(parse_colmap(path, lines).T_world_camera)
+    found = parse_table(path, lines, form, lost=lost)
     if found.times is None:
         return Trajectory(found.T_world_camera, numbers=found.numbers)
-    step = np.diff(found.times)
+    return _in_time(path, found.T_world_camera, found.times, found.lines, repeated)
+
+
+def _in_time(
+    path: Path,
+    T_world_camera: Float[np.ndarray, "n 4 4"],
+    times: Float[np.ndarray, " n"] | None,
+    lines: np.ndarray | None,
+    repeated: bool,
+) -> Trajectory:
+    """A trajectory whose times rise; rows that repeat one are left out where that is allowed."""
+    assert times is not None
+    step = np.diff(times)
     wrong = step < 0 if repeated else step <= 0
     if wrong.any():
         row = int(np.argmax(wrong)) + 1
-        got = f"{found.times[row]:.9f}".rstrip("0")
-        raise input_error("time does not increase", got=got, file=path, line=int(found.lines[row]))
+        got = f"{times[row]:.9f}".rstrip("0")
+        raise input_error("time does not increase", got=got, file=path, line=None if lines is None else int(lines[row]))
     keep = np.concatenate([[True], step > 0])
-    return Trajectory(found.T_world_camera[keep], found.times[keep], "tum", repeated_stamps=int((~keep).sum()))
+    return Trajectory(T_world_camera[keep], times[keep], "tum", repeated_stamps=int((~keep).sum()))
 
 
 def _poses_of_bag(path: Path, lost: bool) -> Trajectory:

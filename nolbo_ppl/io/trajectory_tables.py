@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation, make_pose, nearest_rotation, quaternion_to_matrix
 
-TableFormat = Literal["kitti", "tum", "euroc", "matrix"]
+TableFormat = Literal["kitti", "tum", "euroc", "matrix", "colmap", "nuscenes"]
 """`kitti` 12 numbers a row (3 x 4), `matrix` 16 (4 x 4, or four rows of four), both with an optional leading number of the
-frame or time; `tum` time, position, quaternion x y z w; `euroc` time in ns, position, quaternion w x y z."""
+frame or time; `tum` time, position, quaternion x y z w; `euroc` time in ns, position, quaternion w x y z; `colmap` and
+`nuscenes` are no tables (`trajectory_documents`)."""
 EXPECTED = "12 (KITTI), 16 (4 x 4) or 8 (TUM, EuRoC)"
 MOST_FRAMES = 10_000_000
 """Whole numbers below count frames; from there on they are times in ns, µs or ms."""
@@ -231,7 +232,7 @@ def parse_table(path: Path, lines: Sequence[str], form: TableFormat | None = Non
     found = form or detected_format(rows.table, rows.header, rows.commas)
     width, first = rows.table.shape[1], int(rows.lines[0])
     fitting = {"kitti": width in (12, 13), "matrix": width in (4, 16, 17), "tum": width >= 8, "euroc": width >= 8}
-    if found is None or not fitting[found]:
+    if found is None or not fitting.get(found, False):
         raise input_error(
             "unknown trajectory format" if form is None else f"not in the format {form}",
             got=f"{width} numbers a row",
