@@ -24,6 +24,7 @@ VERBS = {
     "evaluate": "measure a model on unseen scenes",
     "reproduce": "the paper's tables and figures",
     "observe": "posteriors of the objects in a folder of images",
+    "export": "guide and decoder as ONNX files, for programs without torch",
     "data": "what a file or folder is, what it holds, what is wrong with it",
     "convert": "bring real data into the formats of slam and evaluate",
     "simulate": "write a simulated world for slam: odometry, detections, truth",

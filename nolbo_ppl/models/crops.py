@@ -65,6 +65,10 @@ def cut_out(
     offset = torch.stack((x, y), -1).flatten(0, 1)
     image = box.new_zeros(len(box), side * side, 3, dtype=levels[0].dtype)
     for number, pixels in enumerate(levels):
+        if torch.jit.is_tracing():  # a graph has no branches: every object is cut from every level
+            points = centre[:, None] + offset / factor[:, None, None]
+            image = torch.where((level == number)[:, None, None], sample_map(pixels, row, points, 2**number), image)
+            continue
         chosen = (level == number).nonzero().squeeze(-1)
         if len(chosen):
             points = centre[chosen, None] + offset / factor[chosen, None, None]

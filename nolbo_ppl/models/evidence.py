@@ -127,9 +127,18 @@ def detector_evidence(predictions: Predictions, rows: int, columns: int, config:
         device = of_class.device
         known, others = (of_class.index_select(-1, torch.tensor(which, device=device)) for which in (own, rest))
         labels = torch.cat((known, of_class[..., TRUCK, None], others.amax(-1, keepdim=True)), -1)
-        joint = (nn.functional.logsigmoid(predictions.objectness) + known.amax(-1)).clamp(max=-1e-6)
-        log_odds = joint - torch.log(-torch.expm1(joint))
+        named = predictions.classes.index_select(-1, torch.tensor(own, device=device)).amax(-1)
+        log_odds = _joint_log_odds(predictions.objectness, named)
     return gather_evidence(predictions.box, log_odds, labels, predictions.features, rows, columns, config)
+
+
+def _joint_log_odds(found: Tensor, named: Tensor) -> Tensor:
+    """Log odds of two independent events from the log odds of each: 1 / odds = e^-a + e^-b + e^-(a + b)."""
+    if torch.jit.is_tracing():  # exported graphs know no expm1
+        largest = -math.log(math.expm1(1e-6))
+        return -torch.logsumexp(torch.stack((-found, -named, -found - named)), 0).clamp_min(-largest)
+    joint = (nn.functional.logsigmoid(found) + nn.functional.logsigmoid(named)).clamp(max=-1e-6)
+    return joint - torch.log(-torch.expm1(joint))
 
 
 @dataclass

@@ -92,7 +92,7 @@ def ratio_of_height(
         height: px.
         focal: fy, px.
     """
-    turned = hull @ R_camera_object.mT
+    turned = hull @ R_camera_object.transpose(1, 2)
     for _ in range(ROUNDS):
         point = turned + (ray * log_ratio.exp()[:, None])[:, None]
         y = focal[:, None] * point[..., 1] / point[..., 2].clamp_min(0.05)

@@ -236,7 +236,9 @@ class VonMisesMixture(TorchDistribution):
         """
         with torch.no_grad():
             nodes = _circle(grid, self.natural).reshape((-1,) + (1,) * len(self.batch_shape))
-            candidates = torch.cat((nodes.expand(-1, *self.batch_shape), self.component_mean.movedim(-1, 0)))
+            mean = self.component_mean
+            means = mean.permute(mean.dim() - 1, *range(mean.dim() - 1))  # exported graphs know no negative dimensions
+            candidates = torch.cat((nodes.expand(-1, *self.batch_shape), means))
             density = self.log_density(candidates)
             best, index = density.max(0)
             value = candidates.gather(0, index[None])[0]
