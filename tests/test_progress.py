@@ -82,3 +82,14 @@ def test_every_bar_is_one_of_these() -> None:
             for alias in node.names
         }
         assert not names or path.name == "progress.py", f"{path} draws a bar of its own: use nolbo_ppl.progress"
+
+
+def test_a_long_solve_is_seen_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = ["--frames", "40", "--laps", "2", "--radius", "8", "--world.objects", "10"]
+    main(["simulate", "--out", str(tmp_path / "world"), *small])
+    made = terminal(monkeypatch)
+    files = [f"--odometry={tmp_path}/world/odometry.txt", f"--observations={tmp_path}/world/observations.jsonl"]
+    main(["slam", *files, "--out", str(tmp_path / "map")])
+    main(["slam", *files, "--online", "--out", str(tmp_path / "map")])
+    for what in ("tracking", "40/40", "closing loops", "following", "keyframe/s"):
+        assert what in made.getvalue(), what

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -13,7 +13,7 @@ from nolbo_ppl._moved import renamed
 from nolbo_ppl.data.converters.placed_boxes import read_heights
 from nolbo_ppl.data.slam_inputs import read_slam_inputs
 from nolbo_ppl.evaluation.map_calibration import map_calibration
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
+from nolbo_ppl.inference.slam import EmStepInfo, SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import RESULT, is_result, write_result
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.ros_bags import is_bag
@@ -21,6 +21,7 @@ from nolbo_ppl.io.ros_maps import MCAP, write_map_mcap
 from nolbo_ppl.io.trajectories import TIME_TOLERANCE, Trajectory, read_covariance, read_frame_poses
 from nolbo_ppl.io.trajectory_tables import TableFormat
 from nolbo_ppl.io.true_objects import read_true_objects
+from nolbo_ppl.progress import progress_bar
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,8 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
 
         result = solve_incremental(problem, config)
     else:
-        result = solve(problem, config)
+        with progress_bar(None, "closing loops", "iteration", leave=False) as bar:
+            result = solve(problem, config, lambda state, info: _note(bar, info))
     from nolbo_ppl.viz.map_plots import draw_slam_result
 
     stated = None if truth is None and objects is None else map_calibration(result, truth, objects)
@@ -136,6 +138,12 @@ def _solve(arguments: SlamRunConfig, folder: Path) -> tuple[SlamResult, dict[str
         corrected = Trajectory(result.T_world_camera, odometry.times)
         write_map_mcap(folder / MCAP, corrected, result.landmarks, odometry.T_world_camera)
     return result, report | {"remarks": remarks}
+
+
+def _note(bar: Any, info: EmStepInfo) -> None:
+    """One more iteration on the bar."""
+    bar.set_postfix(phase=info.phase, links=info.links, refresh=False)
+    bar.update()
 
 
 def describe(report: dict[str, object]) -> str:

@@ -90,7 +90,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
     return R
 
 
-def is_rotation(matrix: Float[np.ndarray, "... 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " ..."]:
+def is_rotation(matrix: Float[np.ndarray, "... 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " ..."] | np.bool_:
     """Whether each matrix is orthonormal with determinant +1, within `tolerance` an entry."""
     residual = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max(axis=(-2, -1))
     proper: np.ndarray = (residual < tolerance) & (np.linalg.det(matrix) > 0)
@@ -160,7 +160,7 @@ def se3_log(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6"]:
     return np.concatenate([omega, np.einsum("...ij,...j->...i", V_inverse, T[..., :3, 3])], axis=-1)
 
 
-def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."]:
+def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."] | np.float64:
     """Geodesic angle of rotations in rad, `||log R||_F / sqrt 2`, accurate near zero and near pi."""
     angle: np.ndarray = np.linalg.norm(so3_log(R), axis=-1)
     return angle

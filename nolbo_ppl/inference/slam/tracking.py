@@ -20,6 +20,7 @@ from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig, SlamProblem
+from nolbo_ppl.progress import progress_bar
 
 GATE = 30.0
 """Squared Mahalanobis distance beyond which a detection cannot belong to a track (3 degrees of freedom: p = 1e-6)."""
@@ -187,7 +188,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
         frames, starts = np.unique(table.frame[order], return_index=True)
         groups = dict(zip(frames.tolist(), np.split(order, starts[1:])))
         tracker = Tracker(config, table.latent_dim, prior, noise.new_rate, noise.clutter_rate)
-        for t in range(int(frames[0]), int(frames[-1]) + 1):
+        for t in progress_bar(range(int(frames[0]), int(frames[-1]) + 1), "tracking", "frame", leave=False):
             if t:
                 tracker.predict(problem.odometry[t], t, noise.rotation_step[t - 1], noise.translation_step[t - 1])
             rows = groups.get(t)

@@ -43,6 +43,7 @@ from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.tracking import summarise_tracks
 from nolbo_ppl.io.observations import Detections
+from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.structures.landmark import Landmark
 
 MOST_WAIT = 5
@@ -421,7 +422,7 @@ def solve_incremental(problem: SlamProblem, config: SlamConfig | None = None, ca
     slam = IncrementalSlam(config, calibration=SlamProblem(problem.odometry[:calibration_frames], first, part))
     order = np.argsort(problem.observations.frame, kind="stable")
     bounds = np.searchsorted(problem.observations.frame[order], np.arange(len(problem) + 1))
-    for t in range(len(problem)):
+    for t in progress_bar(range(len(problem)), "following", "keyframe", leave=False):
         step = None if covariance is None or not t else covariance[t - 1]
         slam.update(problem.odometry[t], problem.observations.select(order[bounds[t] : bounds[t + 1]]), step)
     return slam.finish()
