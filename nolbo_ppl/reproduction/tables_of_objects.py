@@ -24,7 +24,7 @@ from nolbo_ppl.reproduction.object_answers import (
 from nolbo_ppl.reproduction.paper_numbers import ACCURACY, MEDIAN_ERROR
 from nolbo_ppl.reproduction.paper_numbers import CATEGORIES as PAPER_CATEGORIES
 from nolbo_ppl.reproduction.result_table import ResultTable, over_seeds
-from nolbo_ppl.reproduction.trained_networks import held_out_scenes, trained
+from nolbo_ppl.reproduction.trained_networks import check_scenes, held_out_scenes, trained
 
 RESAMPLES = 300
 """Bootstrap resamples of the scenes, for the interval of a single seed."""
@@ -38,6 +38,7 @@ MOST_POINTS = 1200
 
 def answers(config: ReproduceConfig, name: str, seed: int) -> ObjectAnswers:
     """What a network of a seed answers at the true boxes of the held-out scenes."""
+    check_scenes(config)
     model = trained(config, name, seed)
     return answers_at_boxes(model, held_out_scenes(config, model.config.categories, model.config.symmetry))
 

@@ -13,7 +13,7 @@ from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.single_object_predictor import SingleObjectModel
 from nolbo_ppl.models.baselines.method import METHODS
 from nolbo_ppl.reproduction.budgets import NETWORKS, ReproduceConfig
-from nolbo_ppl.synthetic.dataset_writer import write_scenes
+from nolbo_ppl.synthetic.dataset_writer import SCENES, write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.training.train_config import TrainConfig
@@ -25,10 +25,22 @@ INITIAL = "tiny"
 """Shipped weights whose features all start from."""
 
 
+def own_scenes(config: ReproduceConfig) -> Path | None:
+    """The folder of data where it holds labelled scenes: only then networks learn from it (paths and shapes are other data)."""
+    return config.folder if config.folder is not None and (config.folder / SCENES).is_file() else None
+
+
+def check_scenes(config: ReproduceConfig) -> None:
+    """Raise `InputError` where a folder of data holds no labelled scenes to measure on."""
+    if config.folder is not None and own_scenes(config) is None:
+        raise input_error("no labelled scenes", expected=f"a file {SCENES}, as `nolbo convert` writes it", file=config.folder)
+
+
 def scene_folder(config: ReproduceConfig, held_out: bool) -> Path:
     """Scenes to learn from or held-out ones; a folder of data is both (its last tenth is held out)."""
-    if config.folder is not None:
-        return config.folder
+    own = own_scenes(config)
+    if own is not None:
+        return own
     sizes = config.sizes
     name, seed, count = ("held_out", HELD_OUT_SEED, sizes.held_out) if held_out else ("train", TRAIN_SEED, sizes.scenes)
     folder = config.out / "scenes" / config.budget / name
@@ -49,7 +61,7 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         initial_part="features",
         freeze_encoder=True,
         scenes=(scene_folder(config, held_out=False),),
-        validation=None if config.folder is not None else scene_folder(config, held_out=True),
+        validation=None if own_scenes(config) is not None else scene_folder(config, held_out=True),
         image_size=sizes.image_size,
         seed=seed,
         shape_steps=sizes.shape_steps,
@@ -90,5 +102,5 @@ def trained(config: ReproduceConfig, name: str, seed: int) -> ObservationModel:
 def held_out_scenes(config: ReproduceConfig, categories: Sequence[str], symmetry: Sequence[int]) -> FolderScenes:
     """The scenes to measure on: the held-out folder, or the last tenth of a folder of data."""
     folder = SceneFolder(scene_folder(config, held_out=True), categories, size=config.sizes.image_size, symmetry=symmetry)
-    first = 0 if config.folder is None else len(folder) - max(1, len(folder) // 10)
+    first = 0 if own_scenes(config) is None else len(folder) - max(1, len(folder) // 10)
     return FolderScenes(folder, config.sizes.held_out, first)

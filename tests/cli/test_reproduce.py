@@ -63,6 +63,7 @@ def test_what_cannot_be_reproduced(tmp_path: Path, capsys: pytest.CaptureFixture
         (["table3", "--out", str(tmp_path)], "nothing to reproduce of that name"),
         (["mle", "--out", str(tmp_path / "a"), "--data", str(tmp_path)], "no archive of shapes"),
         (["table2", "--out", str(tmp_path / "a"), "--data", str(tmp_path)], "no paths"),
+        (["table1", "--out", str(tmp_path / "a"), "--data", str(tmp_path)], "no labelled scenes"),
     ):
         with pytest.raises(SystemExit) as stopped:
             main(["reproduce", *arguments])

@@ -15,7 +15,7 @@ from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.reproduction.budgets import NETWORKS, ReproduceConfig
 from nolbo_ppl.reproduction.paper_numbers import ACCURACY, ATE, CATEGORIES, MEDIAN_ERROR, RPE
 from nolbo_ppl.reproduction.result_table import ResultTable, over_seeds
-from nolbo_ppl.reproduction.trained_networks import trained
+from nolbo_ppl.reproduction.trained_networks import own_scenes, scene_folder, trained
 
 
 def test_intervals_over_seeds() -> None:
@@ -73,3 +73,9 @@ def test_options_of_reproductions(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="weights of ae16: got weights of method nolbo, expected those of method ae"):
         trained(ReproduceConfig(tmp_path, weights={"ae16": "tiny"}), "ae16", 0)
     assert not list(tmp_path.iterdir())  # nothing was rendered or trained
+    data = tmp_path / "data"
+    data.mkdir()
+    paths = ReproduceConfig(tmp_path, data=str(data))
+    assert own_scenes(paths) is None  # a folder of paths or shapes is nothing to learn images from
+    (data / "scenes.jsonl").touch()
+    assert own_scenes(paths) == data == scene_folder(paths, held_out=True) and own_scenes(ReproduceConfig(tmp_path)) is None
