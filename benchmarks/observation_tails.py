@@ -1,6 +1,6 @@
-"""Tails of the positions and the largest certainty of a model, fitted on scenes of one seed and measured on those of another.
+"""Tails of the positions and the largest certainty of a model, fitted on scenes that nothing else was fitted on.
 
-    OMP_NUM_THREADS=1 python benchmarks/observation_tails.py [--model tiny] [--scenes 200] [--seed 8801] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/observation_tails.py [--model tiny] [--scenes 200] [--seeds 8801] [--write]
 
 Half of the scenes are standard, half full. With `--write` both numbers go into the model's config.json.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +33,8 @@ class Arguments:
     """Model (a name or a folder)."""
     scenes: int = 200
     """Scenes of each of the two difficulties."""
-    seed: int = 8801
-    """Their seed."""
+    seeds: tuple[int, ...] = (8801,)
+    """Their seeds; so many scenes of each."""
     write: bool = False
     """Write the two numbers into the model's folder."""
 
@@ -41,12 +42,12 @@ class Arguments:
 def answers(model: ObservationModel, arguments: Arguments) -> list[Evaluation]:
     """The model's answers on both kinds of scenes."""
     out = []
-    for difficulty in ("standard", "full"):
+    for seed, difficulty in product(arguments.seeds, ("standard", "full")):
         config = EvaluateConfig(
             Path("unused"),
             model=arguments.model,
             count=arguments.scenes,
-            seed=arguments.seed,
+            seed=seed,
             difficulty=difficulty,
             resamples=10,
         )
