@@ -55,8 +55,8 @@ class FrameModel:
     """Cells of azimuth, rad."""
     elevation_limits: tuple[float, float]
     """Elevations objects are seen at, rad."""
-    clutter_share: Float[np.ndarray, " r"]
-    """Share of false detections by range."""
+    clutter_share: Float[np.ndarray, "r a"]
+    """Share of false detections by range and azimuth: false ones are everywhere, objects stand beside the road."""
     detection_probability: Float[np.ndarray, "r a"]
     """Probability that an object in a cell is detected."""
     stated_share: float = 0.1
@@ -94,6 +94,13 @@ class FrameModel:
         distance = np.linalg.norm(position, axis=1)
         return np.clip(np.searchsorted(self.range_edges, distance, side="right") - 1, 0, len(self.range_edges) - 2)
 
+    def nearest_cell(self, position: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+        """Cell of range and azimuth of each position, the nearest one where it is outside of the view."""
+        columns = len(self.azimuth_edges) - 1
+        azimuth = np.arctan2(position[:, 0], position[:, 2])
+        column = np.clip(np.searchsorted(self.azimuth_edges, azimuth, side="right") - 1, 0, columns - 1)
+        return self.range_cell(position) * columns + column
+
     def cell(self, position: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         """Cell of the view of each position in the camera frame, -1 outside of it."""
         x, y, z = position.T
@@ -123,11 +130,11 @@ class FrameModel:
         """
         if self.clutter_rate is not None:
             return np.full(len(measurements), np.log(self.clutter_rate))
-        return np.log(self.clutter_share[self.range_cell(measurements.position)]) + log_density
+        return np.log(self.clutter_share.ravel()[self.nearest_cell(measurements.position)]) + log_density
 
     def log_objects(self, measurements: Measurements, log_density: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Log density of detections of objects at each detection, per m^3 and frame; arguments as of `log_clutter`."""
-        return np.log1p(-self.clutter_share[self.range_cell(measurements.position)]) + log_density
+        return np.log1p(-self.clutter_share.ravel()[self.nearest_cell(measurements.position)]) + log_density
 
     def log_pattern(
         self, hits: Float[np.ndarray, " m"], exposures: Float[np.ndarray, " m"], mean: Float[np.ndarray, " m"]
@@ -210,7 +217,7 @@ def initial_frame_model(measurements: Measurements, config: SlamConfig, frames: 
         range_edges=edges,
         azimuth_edges=np.linspace(low, high, AZIMUTHS + 1),
         elevation_limits=(float(bottom), float(top)),
-        clutter_share=np.full(RANGES, np.clip(false, 0.01, 0.9)),
+        clutter_share=np.full((RANGES, AZIMUTHS), np.clip(false, 0.01, 0.9)),
         detection_probability=np.full((RANGES, AZIMUTHS), 0.7),
         stated_share=float(np.clip(false, 0.01, 0.9)),
         clutter_rate=config.clutter_rate,
@@ -260,10 +267,11 @@ def estimate_frame_model(
     by_range = hit.reshape(RANGES, -1).sum(1) + PRIOR_COUNT * mean, seen.reshape(RANGES, -1).sum(1) + PRIOR_COUNT
     prior = np.repeat(by_range[0] / by_range[1], AZIMUTHS)
     probability = np.clip((hit + PRIOR_COUNT * prior) / (seen + PRIOR_COUNT), *PROBABILITY_LIMITS)
-    which = model.range_cell(measurements.position)
-    count = np.bincount(which, minlength=RANGES)
+    which = model.nearest_cell(measurements.position)
+    count, false = (np.bincount(which, w, minlength=cells).reshape(RANGES, -1) for w in (np.ones(len(which)), background))
     overall = (background.sum() + SHARE_COUNT * model.stated_share) / (len(background) + SHARE_COUNT)
-    share = (np.bincount(which, background, minlength=RANGES) + PRIOR_COUNT * overall) / (count + PRIOR_COUNT)
+    at_range = (false.sum(1) + PRIOR_COUNT * overall) / (count.sum(1) + PRIOR_COUNT)
+    share = (false + PRIOR_COUNT * at_range[:, None]) / (count + PRIOR_COUNT)
     slope, offset = _fit_score(model, measurements, background, overall)
     model = replace(
         model,
