@@ -93,8 +93,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
 def is_rotation(matrix: Float[np.ndarray, "... 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " ..."] | np.bool_:
     """Whether each matrix is orthonormal with determinant +1, within `tolerance` an entry."""
     residual = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max(axis=(-2, -1))
-    proper: np.ndarray = (residual < tolerance) & (np.linalg.det(matrix) > 0)
-    return proper
+    return np.asarray((residual < tolerance) & (np.linalg.det(matrix) > 0))
 
 
 def make_pose(R: Float[np.ndarray, "... 3 3"], position: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4 4"]:
