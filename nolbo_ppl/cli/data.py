@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from nolbo_ppl.data import picture_formats  # noqa: F401 (registers its formats)
 from nolbo_ppl.data.converters import archive_formats  # noqa: F401 (registers its formats)
 from nolbo_ppl.data.format_registry import FORMATS, FormatReport, check_data
 from nolbo_ppl.data.known_formats import spread  # noqa: F401 (registers its formats)

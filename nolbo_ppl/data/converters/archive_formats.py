@@ -15,6 +15,7 @@ import numpy as np
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage
 from nolbo_ppl.data.converters.pascal3d import read_objectnet3d, read_pascal3d, read_record
+from nolbo_ppl.data.converters.pix3d import read_pix3d
 from nolbo_ppl.data.converters.voc import read_voc, read_voc_annotation
 from nolbo_ppl.data.format_registry import LIKELY, SURE, FormatReport, LabelledPicture, Look, register
 from nolbo_ppl.errors import InputError, input_error
@@ -73,6 +74,12 @@ labelled(
     "ObjectNet3D",
     lambda look: LIKELY if {"Annotations", "Images", "Image_sets"} <= look.names and "PASCAL" not in look.names else 0.0,
     lambda path: read_objectnet3d(path, None),
+)
+labelled(
+    "pix3d",
+    "Pix3D",
+    lambda look: SURE if "pix3d.json" in look.names else 0.0,
+    lambda path: read_pix3d(path),
 )
 labelled(
     "voc",
