@@ -24,6 +24,9 @@ from nolbo_ppl.models.observed_scene import RegionParameters
 RATIO_SCALE = 0.15
 """Scale of log (range / diagonal) as a box's height tells it: instances are taller or lower, boxes cut off what is hidden. Of
 26 cars of street photographs half are within 0.07."""
+GUIDE_LOG_SCALE = 0.25
+"""Error of the guide's own log range and log diagonal in photographs, added to the scales it states, which generated scenes taught:
+of a motorbike 2.4 m away it was sure to a twentieth, and wrong by half."""
 FOCAL_LOG_SCALE = 0.35
 """Scale of the log focal length of a camera that nobody states: views of 35 to 85 degrees across are within two of them."""
 HULL_POINTS = 96
@@ -137,7 +140,7 @@ def with_metric_size(
     log_mean, size_precision = known.sizes(label)
     size_precision = known.share * size_precision
     # Deviations du, dv from the guide's means: N(du; 0, s0^2) N(dv; 0, s1^2) N(du - dv; change, .) N(dv; log_mean - log d, .)
-    own = scale.square().reciprocal()
+    own = (scale.square() + known.share[:, None] * GUIDE_LOG_SCALE**2).reciprocal()
     a, b, c = own[:, 0] + ratio_precision, -ratio_precision, own[:, 1] + ratio_precision + size_precision
     first = ratio_precision * change
     second = size_precision * (log_mean - torch.log(diagonal)) - ratio_precision * change

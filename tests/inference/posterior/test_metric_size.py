@@ -12,6 +12,7 @@ import torch
 from nolbo_ppl.geometry.rotation import viewpoint_to_matrix
 from nolbo_ppl.inference.posterior.metric_size import (
     FOCAL_LOG_SCALE,
+    GUIDE_LOG_SCALE,
     RATIO_SCALE,
     MetricKnowledge,
     ratio_of_height,
@@ -73,7 +74,7 @@ def answer(share: float = 1.0, guessed: bool = False, extent: float = 300.0, siz
 def test_the_product_is_that_of_the_densities() -> None:
     q, after, box, sizes = answer()
     spread = torch.tensor([CONFIG.range_spread[0], CONFIG.range_spread[3]])
-    s0, s1 = (q.range_scale[0, [0, 3]] * spread).tolist()
+    s0, s1 = ((q.range_scale[0, [0, 3]] * spread) ** 2 + GUIDE_LOG_SCALE**2).sqrt().tolist()
     u, v = torch.meshgrid(torch.linspace(-2.5, 2.5, 1201), torch.linspace(-2.5, 2.5, 1201), indexing="ij")
     change = -math.log(2)  # nearer by half, up to perspective
     mean, precision = (float(value[0]) for value in sizes(torch.tensor([0])))
@@ -91,9 +92,11 @@ def test_the_product_is_that_of_the_densities() -> None:
 
 
 def test_what_says_nothing_changes_nothing() -> None:
-    for case in (answer(share=0.0), answer(extent=100.0, sized=False)):  # a generated scene; a box cut off by the border
-        torch.testing.assert_close(case[1].range_loc, case[0].range_loc)
-        torch.testing.assert_close(case[1].range_scale, case[0].range_scale)
+    generated, cut_off = answer(share=0.0), answer(extent=100.0, sized=False)
+    torch.testing.assert_close(generated[1].range_loc, generated[0].range_loc)
+    torch.testing.assert_close(generated[1].range_scale, generated[0].range_scale)
+    torch.testing.assert_close(cut_off[1].range_loc, cut_off[0].range_loc)  # by the border: its height says nothing
+    assert bool((cut_off[1].range_scale >= cut_off[0].range_scale).all())
     stated, guessed = answer()[1], answer(guessed=True)[1]
     spread = CONFIG.range_spread[0]
     variance = (guessed.range_scale[0, 0] * spread) ** 2 - (stated.range_scale[0, 0] * spread) ** 2
