@@ -105,7 +105,9 @@ def null_calibration_error(
     return np.array([expected_calibration_error(p, rng.random(len(p)) < p, bins=bins)[0] for _ in range(draws)])
 
 
-def debiased_calibration_error(confidence: Float[np.ndarray, " n"], outcome: Bool[np.ndarray, " n"], bins: int = BINS) -> float:
+def debiased_calibration_error(
+    confidence: Float[np.ndarray, " n"], outcome: Bool[np.ndarray, " n"] | Float[np.ndarray, " n"], bins: int = BINS
+) -> float:
     """Root of the squared calibration error less the part that noise makes (Bröcker 2012; Kumar et al. 2019, section 4).
 
     In each bin the squared gap of means is above its true value by the variance of the frequency, estimated without bias by
