@@ -281,7 +281,7 @@ def test_slam_folder_alone_gives_a_report(run_folder: Path, browser: Browser, tm
     browser.until("document.documentElement.dataset.ready === 'yes'")
     assert browser.errors == []
     sections = browser.run("[...document.querySelectorAll('section')].map(x => x.id)")
-    assert sections == ["trajectory", "map", "loops", "association", "landmarks", "em", "figures", "how"]
+    assert sections == ["trajectory", "map", "loops", "association", "landmarks", "calibration", "em", "figures", "how"]
     assert browser.run("document.querySelector('.tile .name').textContent") == "ATE"  # from the summary
     # With its inputs named, nothing is missing.
     inputs = {name: run_folder / f"{name}.txt" for name in ("odometry", "truth")}
