@@ -34,6 +34,8 @@ NEAR_SCALE = 0.3
 """How far that place may lie from there, in half extents."""
 HIDDEN = 0.1
 """Standard deviation of a box's height in parts of it: what stands before an object hides its lower edge."""
+OPEN = 100.0
+"""Scale, in its own, of a range that is to have no say."""
 GATE = 3.0
 """A range that lies so many scales from the guide's is that of another thing: half an object, a toy."""
 
@@ -77,6 +79,8 @@ def refine_by_height(
 ) -> ObjectPosteriors:
     """Positions, their covariances and sizes with the usual heights of categories taken into account; other answers stay.
 
+    Ranges that hold a height already (`ObjectPosteriors.sized`) are replaced where the new one fits them, others multiplied.
+
     Args:
         observed: what the guide says of an image.
         intrinsics: fx, fy, cx, cy, px.
@@ -91,7 +95,10 @@ def refine_by_height(
     measured, scale = usual_range(observed, intrinsics, image_size, USUAL_HEIGHTS if heights is None else heights)
     along = np.sqrt(np.einsum("ni,nij,nj->n", ray, observed.position_covariance, ray))
     fits = np.abs(measured - distance) < GATE * np.hypot(scale, along)
-    refined, covariance = fuse_along_ray(position, observed.position_covariance, np.where(fits, measured, np.nan), scale)
+    covariance = np.asarray(observed.position_covariance, dtype=np.float64)
+    if observed.sized:  # the same height is in that range already: this one takes its place
+        covariance = covariance + (OPEN * along[:, None, None]) ** 2 * fits[:, None, None] * ray[:, :, None] * ray[:, None, :]
+    refined, covariance = fuse_along_ray(position, covariance, np.where(fits, measured, np.nan), scale)
     # What fills the same pixels from another distance has another size.
     factor = np.linalg.norm(refined, axis=1) / distance
     return replace(

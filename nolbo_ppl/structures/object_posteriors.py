@@ -109,6 +109,9 @@ class ObjectPosteriors:
     describes: bool = True
     """The model states categories and viewpoints; without them all are equally likely here, and missing in detections
     (`nolbo_ppl.models.baselines.method`)."""
+    sized: bool = False
+    """Distances and sizes already hold what a box's height and a category's size tell; who knows better sizes replaces them,
+    for the same height counted twice would be too sure."""
     shift: float | None = None
     """How unlike the images that were learnt from this image is: 0 like the middle one, 1 as 3 in 100; beyond, objects are less
     probable and every scale is wider. None for models that cannot tell."""

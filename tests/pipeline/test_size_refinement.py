@@ -43,6 +43,7 @@ def cars(rng: np.random.Generator, count: int) -> tuple[SimpleNamespace, np.ndar
         position_covariance=covariance,
         R_camera_object=rotation,
         size=factor[:, None] * size,
+        sized=False,
     )
     return observed, centre
 
@@ -92,6 +93,22 @@ def test_refined_positions_sizes_and_what_stays(monkeypatch: pytest.MonkeyPatch)
     gap = refined.position[used] - centre[used]
     square = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(refined.position_covariance[used]), gap)
     assert np.mean(square < 6.25) > 0.85
+
+
+def test_a_height_is_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nolbo_ppl.pipeline.size_refinement.replace", lambda old, **new: Answers(**(vars(old) | new)))
+    plain, _ = cars(np.random.default_rng(1), 60)
+    observed = Answers(**(vars(plain) | {"sized": True}), diagonal=np.linalg.norm(plain.size, axis=1))
+    found, scale = usual_range(observed, CAMERA, SIZE, USUAL_HEIGHTS)  # type: ignore[arg-type]
+    after = refine_by_height(observed, CAMERA, SIZE)  # type: ignore[arg-type]
+    moved = np.abs(after.position - observed.position).max(axis=1) > 1e-9
+    assert moved.any()
+    distance = np.linalg.norm(after.position, axis=1)
+    np.testing.assert_allclose(distance[moved], found[moved], rtol=1e-3)  # the height alone
+    ray = after.position / distance[:, None]
+    along = np.sqrt(np.einsum("ni,nij,nj->n", ray, after.position_covariance, ray))
+    np.testing.assert_allclose(along[moved], scale[moved], rtol=1e-2)
+    np.testing.assert_allclose(after.position_covariance[~moved], observed.position_covariance[~moved])
 
 
 def test_usual_heights_are_for_the_weights_of_photographs_unless_told() -> None:
