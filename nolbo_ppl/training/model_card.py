@@ -11,6 +11,8 @@ from nolbo_ppl.io.files import atomic_path
 from nolbo_ppl.models.model_config import ModelConfig
 
 CARD = "README.md"
+REPEATED = ("scenes",)
+"""Options that are given once for each of their values."""
 
 
 def command_of(options: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
@@ -24,6 +26,8 @@ def command_of(options: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
             words.append(f"--{flag}" if value else f"--no-{flag}")
         elif isinstance(value, Mapping):
             words += [f"--{flag}", *(str(word) for pair in value.items() for word in pair)]
+        elif name in REPEATED:
+            words += [word for one in value for word in (f"--{flag}", str(one))]
         elif isinstance(value, list):
             words += [f"--{flag}", *map(str, value)]
         else:

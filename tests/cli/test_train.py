@@ -129,6 +129,8 @@ def test_the_model_can_be_loaded_and_tells_how_it_came_about(uninterrupted: Path
     model = load(uninterrupted / "model")
     assert model.config.image_size == 64
     values = read_json(uninterrupted / "model" / "config.json")
+    card = (uninterrupted / "model" / "README.md").read_text()
+    assert "nolbo train" in card and "| box50 |" in card  # what to publish beside the weights
     assert values["training"]["preset"] == "nano"
     assert values["calibrated"] is True
     assert set(values["held_out"]) >= {"bound", "bound/voxels", "inclusive/objectness", "box50", "category"}
