@@ -36,14 +36,15 @@ UNCHECKED = "tests/inference/slam/"
 tests of `geometry`, of the commands and of runs check the same calls."""
 
 
-@pytest.fixture(autouse=True)
-def _bad_input_reaches_the_library(request: pytest.FixtureRequest) -> Iterator[None]:
-    """A test that expects an error hands in what is wrong, and is about the library's own message: nothing checks before it."""
-    test = inspect.unwrap(request.node.function) if isinstance(request.node, pytest.Function) else None
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test that expects an error hands in what is wrong, and is about the library's own message: nothing checks before it.
+
+    Before its fixtures, which may be those of a whole module.
+    """
+    test = inspect.unwrap(item.function) if isinstance(item, pytest.Function) else None
     bad_input = test is not None and "raises" in test.__code__.co_names
-    jaxtyping.config.update("jaxtyping_disable", bad_input or request.node.nodeid.startswith(UNCHECKED))
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", bad_input or item.nodeid.startswith(UNCHECKED))
 
 
 @pytest.fixture(autouse=True)
