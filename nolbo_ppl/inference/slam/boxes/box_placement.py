@@ -22,7 +22,7 @@ SHARE = 3.0
 """How wide along the ray: 1 / SHARE^2 is the part of the information on depth that is counted twice."""
 CENTRE_SHARE = 0.05
 """Standard deviation of a box's centre from the object's, in parts of the box."""
-LEAST_PIXELS = 1.0
+MIN_PIXELS = 1.0
 """Least standard deviation of a box's centre, px."""
 MISFIT = 3.0
 """Root mean square residual above which a track is of no one static object."""
@@ -67,7 +67,7 @@ def rays_of(
     tall = extent[:, 1] / intrinsics[1]
     return BoxRays(
         direction=(centre - intrinsics[2:]) / intrinsics[:2],
-        scale=np.maximum(CENTRE_SHARE * extent, LEAST_PIXELS) / intrinsics[:2],
+        scale=np.maximum(CENTRE_SHARE * extent, MIN_PIXELS) / intrinsics[:2],
         height=tall,
         category=np.array([names.index(name) for name in category], dtype=np.int64),
         depth=height / tall,

@@ -26,7 +26,7 @@ OUTLIER = 0.05
 """Share of a box's centres that say nothing: gross errors of detectors."""
 UNIFORM_LOG_HEIGHT = np.log(3.0)
 """Log heights of boxes lie within about three nats."""
-LEAST_WEIGHT = 1e-6
+MIN_WEIGHT = 1e-6
 """Depths of less weight are given up."""
 MISSED = 0.2
 """Probability that an object with a track is not detected in a frame."""
@@ -197,7 +197,7 @@ class BoxTracker:
         self.covariance[m, ahead] = 0.5 * (smaller + np.swapaxes(smaller, 1, 2))
         value = self.log_weight[m] + np.logaddexp(np.log1p(-OUTLIER) + direction, np.log(OUTLIER) - self.log_view)
         value -= logsumexp(value)
-        value[value < np.log(LEAST_WEIGHT)] = -np.inf
+        value[value < np.log(MIN_WEIGHT)] = -np.inf
         self.log_weight[m] = value - logsumexp(value)
         z = np.maximum((self.mean[m] - T[:3, 3]) @ T[:3, 2], 1e-3)
         rate = 1 / min(self.views[m] + 1, 4)  # the side that is seen changes
