@@ -90,10 +90,10 @@ def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
     return R
 
 
-def is_rotation(matrix: Float[np.ndarray, "... 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " ..."] | np.bool_:
+def is_rotation(matrix: Float[np.ndarray, "... 3 3"], tolerance: float = 1e-3) -> Bool[np.ndarray, " ..."]:
     """Whether each matrix is orthonormal with determinant +1, within `tolerance` an entry."""
     residual = np.abs(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)).max(axis=(-2, -1))
-    return np.asarray((residual < tolerance) & (np.linalg.det(matrix) > 0))
+    return np.asarray((residual < tolerance) & (np.linalg.det(matrix) > 0))  # of one matrix too: an array of no dimension
 
 
 def make_pose(R: Float[np.ndarray, "... 3 3"], position: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 4 4"]:
@@ -159,10 +159,9 @@ def se3_log(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6"]:
     return np.concatenate([omega, np.einsum("...ij,...j->...i", V_inverse, T[..., :3, 3])], axis=-1)
 
 
-def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."] | np.float64:
+def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."]:
     """Geodesic angle of rotations in rad, `||log R||_F / sqrt 2`, accurate near zero and near pi."""
-    angle: np.ndarray = np.linalg.norm(so3_log(R), axis=-1)
-    return angle
+    return np.asarray(np.linalg.norm(so3_log(R), axis=-1))
 
 
 def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None) -> np.ndarray:
