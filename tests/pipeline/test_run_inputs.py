@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ from PIL import Image
 
 from nolbo_ppl.data.sequences import open_frames
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.odometry import GroundHeight, KnownLengths
+from nolbo_ppl.io.run_folder import RunFolder
+from nolbo_ppl.odometry import GroundHeight, KnownLengths, MeasuredDepth, StepFlag
 from nolbo_ppl.pipeline.depth_refinement import DepthScale
 from nolbo_ppl.pipeline.perception import DepthImages, SequenceDepth, StereoPairs, beside, observe_sequence
 from nolbo_ppl.pipeline.run_config import RunConfig
-from nolbo_ppl.pipeline.run_inputs import lengths_between, open_run_inputs, scale_of
+from nolbo_ppl.pipeline.run_inputs import depth_of_drive, lengths_between, open_run_inputs, scale_of
+from nolbo_ppl.pipeline.run_summary import odometry_scores
 from nolbo_ppl.structures.detections import Detections
 from tests.simulated_sequence import CAMERA, SimulatedDrive
 
@@ -101,3 +104,36 @@ def test_stereo_pairs_match_left_and_right() -> None:
     source = StereoPairs(lambda k: texture[:, 12:212], 100.0, 0.3)
     depth = source.depth(0, texture[:, :200])
     assert depth is not None and np.nanmedian(depth[10:-10, 40:-10]) == pytest.approx(100.0 * 0.3 / 12, rel=0.02)
+
+
+def test_doubtful_steps_are_counted_in_the_summary(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    flags = np.array([0, StepFlag.STILL, StepFlag.WEAK | StepFlag.NO_SCALE, 0], dtype=np.uint8)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    run.write_odometry(poses, np.tile(np.eye(6), (4, 1, 1)), flags)
+    counted = odometry_scores(RunFolder(tmp_path))["odometry"]
+    assert counted["steps"] == 4 and counted["doubtful"] == 2
+    assert {name for name, count in counted.items() if count == 1} == {"STILL", "WEAK", "NO_SCALE"}
+    given = RunFolder(tmp_path / "given")
+    given.path.mkdir()
+    given.write_odometry(poses, np.tile(np.eye(6), (4, 1, 1)))
+    assert odometry_scores(RunFolder(given.path)) == {}
+
+
+def test_lengths_come_from_depth_before_the_truth(tmp_path: Path) -> None:
+    """Visual odometry takes a height or a wheel where it is given, then depth images, then the truth."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "depth").mkdir()
+    for k in range(2):
+        Image.new("RGB", (64, 48), (90, 90, 90)).save(tmp_path / "images" / f"{k}.png")
+        Image.fromarray(np.full((48, 64), 1000, dtype=np.uint16)).save(tmp_path / "depth" / f"{k}.png")
+    (tmp_path / "camera.txt").write_text("60 60 32 24 0.01 0 0 0 0")  # a lens, whose distortion is taken out of both
+    (tmp_path / "truth.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {k}\n" for k in range(2)))
+    made = {"images": tmp_path / "images", "out": tmp_path / "out", "intrinsics": tmp_path / "camera.txt"}
+    both = RunConfig(**made, truth=tmp_path / "truth.txt", depth=tmp_path / "depth", depth_unit=0.001)
+    drive = open_run_inputs(both)
+    assert isinstance(scale_of(drive, both), MeasuredDepth)
+    depth = depth_of_drive(drive, both, [1]).depth(0, drive.frames.frame(1))
+    assert depth is not None and depth.shape == (48, 64) and np.nanmedian(depth) == pytest.approx(1.0)
+    assert isinstance(scale_of(drive, replace(both, camera_height=1.5)), GroundHeight)
+    assert isinstance(scale_of(drive, replace(both, depth=None)), KnownLengths)
