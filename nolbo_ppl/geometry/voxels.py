@@ -60,7 +60,7 @@ def resized_bits(packed: UInt8[np.ndarray, "*batch bytes"], n: int, wanted: int)
             grid = np.repeat(grid, wanted // n, axis=axis)
     elif n % wanted == 0:
         k = n // wanted
-        grid = grid.reshape(*grid.shape[:-3], wanted, k, wanted, k, wanted, k).any(axis=(-5, -3, -1))
+        grid = np.asarray(grid.reshape(*grid.shape[:-3], wanted, k, wanted, k, wanted, k).any(axis=(-5, -3, -1)))
     else:
         raise input_error("size of a voxel grid", got=f"{n} for {wanted}", expected="one a multiple of the other")
     return pack_voxels(grid)
