@@ -182,7 +182,7 @@ def parse_record(
     if exhaustive is not None and not (isinstance(exhaustive, list) and all(name in list(categories) for name in exhaustive)):
         raise at.error("exhaustive", exhaustive, "a list of categories among " + ", ".join(categories))
     ignore = [_parse_box(at, {"box": box}, f"ignore[{k}].", *image_size) for k, box in enumerate(regions)]
-    columns = ("box", "category", "instance", "id", "R_camera_object", "position", "diagonal", "dimensions")
+    columns: tuple[str, ...] = ("box", "category", "instance", "id", "R_camera_object", "position", "diagonal", "dimensions")
     columns += ("visibility", "symmetry", "confidence", "category_confidence")
     values: dict[str, Any] = {name: [thing[name] for thing in parsed] for name in columns}
     return Annotations.from_arrays(intrinsics, **values, ignore=ignore, exhaustive=exhaustive, file=image)

@@ -87,7 +87,7 @@ def relative_pose_error(
     motion_true = relative(T_truth[first], T_truth[first + delta])
     error = relative(motion_true, motion)
     if part == "rotation":
-        return summarise(rotation_angle(error[:, :3, :3]))
+        return summarise(np.asarray(rotation_angle(error[:, :3, :3])))
     return summarise(np.linalg.norm(error[:, :3, 3], axis=1))
 
 

@@ -132,7 +132,7 @@ class SceneBatch:
         labels["viewpoint"] = allocentric_viewpoints(labels)
         fill_regions(labels, scenes, categories, [(1.0, 0.0, 0.0)] * len(scenes))
         images = np.stack([scene.image.transpose(2, 0, 1) for scene in scenes])
-        arrays = assemble(images, labels, voxels, voxels.any(axis=-1))
+        arrays = assemble(images, labels, voxels, np.asarray(voxels.any(axis=-1)))
         return cls(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()})
 
     def replace(self, **changes: Any) -> SceneBatch:

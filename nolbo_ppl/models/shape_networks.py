@@ -35,6 +35,7 @@ class StandardPrior(nn.Module):
 
     def __init__(self, labels: int, latent_dim: int) -> None:
         super().__init__()
+        self.mean: Tensor
         self.register_buffer("mean", torch.zeros(labels, latent_dim), persistent=False)
 
     def forward(self) -> Float[Tensor, "labels latent_dim"]:

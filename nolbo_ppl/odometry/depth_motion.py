@@ -60,7 +60,7 @@ def depth_at(depth: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"], 
     height, width = depth.shape
     place = np.asarray(pixels, dtype=np.float64) * zoom - 0.5
     nearest = np.floor(place + 0.5).astype(np.int64)
-    inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
+    inside = np.asarray(((nearest >= 0) & (nearest < [width, height])).all(axis=1))
     across, up = np.meshgrid([-1, 0, 1], [-1, 0, 1])
     u, v = nearest[:, :1] + across.ravel(), nearest[:, 1:] + up.ravel()
     known = inside[:, None] & (u >= 0) & (u < width) & (v >= 0) & (v < height)

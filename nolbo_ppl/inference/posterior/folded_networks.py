@@ -58,7 +58,7 @@ class FoldedEncoder(nn.Module):
             elif isinstance(module, ResidualBlock):
                 module.second = folded(module.second, module.norm)  # type: ignore[assignment]
                 module.norm = nn.Identity()  # type: ignore[assignment]
-        self.network = network.to(dtype=dtype, memory_format=torch.channels_last)
+        self.network = network.to(dtype=dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b c gh gw"], tuple[Tensor, ...]]:
         """Features of every cell, and the finer maps."""
@@ -190,4 +190,4 @@ class FoldedNetworks:
             return
         with torch.no_grad(), torch.inference_mode(False):
             self._guide = folded_guide(self.model.guide, kernel_type())
-            self._decoder = FoldedDecoder(self.model.story.decoder, kernel_type())
+            self._decoder = FoldedDecoder(self.model.story.decoder, kernel_type())  # type: ignore[assignment]

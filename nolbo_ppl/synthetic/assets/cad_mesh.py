@@ -100,7 +100,8 @@ def mesh_to_shape(
     if not area.sum() > 1e-9:
         raise input_error("degenerate CAD mesh: its faces have no area", got=f"{len(faces)} faces", file=file)
     points, faces, kept = _simplify(points, faces[area > 0], max_faces)
-    part, parts = np.zeros(len(faces), dtype=np.int64), ("body",)
+    part = np.zeros(len(faces), dtype=np.int64)
+    parts: tuple[str, ...] = ("body",)
     if colours is not None:
         part, parts = painted_parts(colours[area > 0][kept])
     fill: Solid = MeshSolid(points, faces) if solid is None else solid
