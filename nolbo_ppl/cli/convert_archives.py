@@ -43,7 +43,7 @@ def shapes_of(root: Path, images: Iterable[ArchiveImage], side: int, cache: Path
 class Shapes:
     """How shapes are filled."""
 
-    grid: Literal[32, 64] = GRID
+    grid: Literal[32, 64] = GRID  # type: ignore[assignment]
     """Voxels along an edge of each shape."""
     cache: Path = DEFAULT_CACHE
     """Where voxels of CAD files are kept between runs."""

@@ -334,6 +334,7 @@ def report_scenes(path: Path) -> FormatReport:
     for k in spread(len(folder), LOOKED_AT):
         file = folder.records[k].file
         try:
+            assert file is not None  # the folder has found it
             sizes[image_size(file)] += 1
         except InputError as error:
             problems.append(str(error))

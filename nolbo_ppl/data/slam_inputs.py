@@ -83,7 +83,7 @@ def _select(found: ForeignDetections, rows: np.ndarray) -> ForeignDetections:
     """Some of the detections."""
     names = ("frame", "box", "score", "position", "rotation", "size", "mask_centre", "covariance")
     values = {name: getattr(found, name) for name in names}
-    chosen = {name: None if value is None else value[rows] for name, value in values.items()}
+    chosen: dict[str, Any] = {name: None if value is None else value[rows] for name, value in values.items()}
     return ForeignDetections(category=tuple(found.category[k] for k in rows), **chosen)
 
 

@@ -207,7 +207,7 @@ class Bag:
 def _seconds(header: Any, recorded: int) -> float:
     if header is None or not (header.stamp.sec or header.stamp.nanosec):
         return recorded * 1e-9
-    return header.stamp.sec + header.stamp.nanosec * 1e-9
+    return float(header.stamp.sec + header.stamp.nanosec * 1e-9)
 
 
 class TopicCursor:

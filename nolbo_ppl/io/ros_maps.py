@@ -91,8 +91,8 @@ class _Messages:
         mesh = self.make("visualization_msgs/MeshFile", "", np.zeros(0, np.uint8))
         rgba = self.make("std_msgs/ColorRGBA", *(float(v) for v in colour))
         forever = self.make("builtin_interfaces/Duration", 0, 0)
-        drawn = (self.pose(T), self.vector("Vector3", scale), rgba, forever, False, [], [])
-        rest = ("", nothing, [], text, "", mesh, False)
+        drawn: tuple[Any, ...] = (self.pose(T), self.vector("Vector3", scale), rgba, forever, False, [], [])
+        rest: tuple[Any, ...] = ("", nothing, [], text, "", mesh, False)
         return self.make("visualization_msgs/Marker", self.header(time, WORLD), space, number, kind, 0, *drawn, *rest)
 
     def objects(self, landmarks: Sequence[Landmark], time: int) -> Any:

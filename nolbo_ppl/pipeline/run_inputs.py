@@ -201,9 +201,9 @@ def estimate_or_read(drive: RunInputs, config: RunConfig) -> FoundOdometry:
             depth = partial(_depth, source, frames)
         found = estimate_odometry(frames, drive.intrinsics, scale, config.visual, progress=True, depth=depth)
         return FoundOdometry(found, stated=True, estimated=True)
-    frames = drive.frames
+    images = drive.frames
     poses = poses_of_frames(
-        config.odometry, len(frames), frames.times, interpolate=is_bag(config.odometry), what="odometry", of="the images"
+        config.odometry, len(images), images.times, interpolate=is_bag(config.odometry), what="odometry", of="the images"
     )
     covariance = covariance_beside(config.odometry)
     stated = covariance is not None and len(covariance) == len(poses) - 1

@@ -74,7 +74,8 @@ def calibration(run: RunFolder) -> str:
         levels = list(dict.fromkeys(k for r in regions.values() if isinstance(r.get("coverage"), dict) for k in r["coverage"]))
         rows = []
         for name, record in regions.items():
-            coverage = record.get("coverage") if isinstance(record.get("coverage"), dict) else {}
+            coverage = record.get("coverage")
+            coverage = coverage if isinstance(coverage, dict) else {}
             cells = [escape(REGIONS.get(name, name)), escape(say(record.get("count"))), escape(say(record.get("nees"), 3))]
             rows.append([*cells, *(escape(say(coverage.get(level), 3)) for level in levels)])
         head = ["", "cases", "NEES / dof", *(escape(f"in {level} %") for level in levels)]

@@ -380,7 +380,7 @@ def _read_size(chosen: tuple[int, ...], single: bool) -> int:
 def _adopt(config: PaperConfig, model: Nolbo) -> None:
     """The weights a stage goes on with."""
     if config.core is not None:
-        adopt_core(model.guide.encoder.core, config.core)  # type: ignore[union-attr]
+        adopt_core(model.guide.encoder.core, config.core)  # type: ignore[union-attr, arg-type]
     if config.decoder is not None:
         part = load(_model_folder(config.decoder), "cpu").model
         for name in ("story.decoder", "shape_guide"):  # the prior is fresh: its labels are others

@@ -21,6 +21,7 @@ from nolbo_ppl.evaluation.scores import REQUIRED, confusion, flipped
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels, voxel_centres
 from nolbo_ppl.metrics.detection import match
+from nolbo_ppl.metrics.intervals import IntervalEstimate
 from nolbo_ppl.models.model_config import tiny
 from nolbo_ppl.structures.annotations import ARRAYS, Annotations
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
@@ -332,7 +333,7 @@ def test_small_and_hidden_objects_do_not_count():
     result = measure(config(), exact_oracle(hidden, viewpoints), hidden)
     assert len(result.objects) == 20 and set(result.objects.slot) == {2, 3}
     # Everything is found, what does not count included, and none of that is held against the model.
-    assert result.figures["ap50"] == evaluate.IntervalEstimate(1.0, 1.0, 1.0, 20)
+    assert result.figures["ap50"] == IntervalEstimate(1.0, 1.0, 1.0, 20)
     assert result.detections.all.ignored.sum() == 20
 
 

@@ -62,10 +62,10 @@ class UndistortedFrames(FrameSequence):
 
     def depth_of_lens(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
         """A depth image that is registered to a frame as the lens took it, without the distortion; 0 where unknown."""
-        if self.camera.model is None:
+        camera, model = self.camera, self.camera.model
+        if model is None:
             return depth
-        camera = self.camera
-        return undistort_depth(depth, camera.vector, camera.model, camera.distortion, self.pinhole.vector, self.size)
+        return undistort_depth(depth, camera.vector, model, camera.distortion, self.pinhole.vector, self.size)
 
 
 def without_distortion(frames: FrameSequence, camera: CameraIntrinsics) -> tuple[FrameSequence, CameraIntrinsics]:
