@@ -106,11 +106,11 @@ def read_bag_detections(path: str | PathLike[str]) -> BagDetections:
             T = moved[frame]
             for detection in message.detections:
                 best = max(detection.results, key=lambda one: _hypothesis(one)[1], default=None)
-                category, score = ("object", 1.0) if best is None else _hypothesis(best)
+                category, certainty = ("object", 1.0) if best is None else _hypothesis(best)
                 position, covariance, rotation, size = _place(detection, best)
                 R = T[:3, :3]
                 placed = (R @ position + T[:3, 3], R @ covariance @ R.T, R @ rotation, size)
-                rows.append((len(times), _box(detection), score, category, *placed))
+                rows.append((len(times), _box(detection), certainty, category, *placed))
             times.append(time)
 
     def column(k: int, *shape: int) -> np.ndarray:
