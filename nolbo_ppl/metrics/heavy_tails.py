@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from scipy.optimize import minimize
 from scipy.special import gammaln
 from scipy.stats import f
@@ -96,11 +96,15 @@ def fit_student_t(squared: Float[np.ndarray, " n"], dimensions: int) -> StudentT
     return StudentT(float(np.exp(best.x[1])), float(np.exp(best.x[0])))
 
 
-def supported_probability(stated: Float[np.ndarray, " n"], happened: Float[np.ndarray, " n"]) -> float:
+def supported_probability(stated: Float[np.ndarray, " n"], happened: Shaped[np.ndarray, " n"]) -> float:
     """The largest probability that held-out cases support: of those stated near one, `(k + 1) / (n + 2)` came true.
 
     The best over groups stated above several levels, each under a uniform prior: 400 cases without a mistake support 0.9975, no
     number of them supports certainty.
+
+    Args:
+        stated: probabilities.
+        happened: whether each came true, as booleans or as 0 and 1.
 
     Raises:
         InputError: no case, or shapes that do not match.
