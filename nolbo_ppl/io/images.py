@@ -6,6 +6,7 @@ Whatever the file is, every verb sees upright RGB of eight bits; depth images ke
 from __future__ import annotations
 
 import re
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
@@ -31,7 +32,7 @@ UNREADABLE = {".heic": "convert HEIC to JPEG or PNG first", ".heif": "convert HE
 """Endings of pictures that are not read, and what to do about them."""
 
 Source = tuple[str | PathLike[str], int | None]
-File = str | PathLike[str] | BinaryIO
+File = str | PathLike[str] | BinaryIO | BytesIO
 """A file, or the bytes of one."""
 
 

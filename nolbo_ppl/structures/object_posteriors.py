@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.pose import quaternion_to_matrix
@@ -119,7 +119,7 @@ class ObjectPosteriors:
     def __len__(self) -> int:
         return len(self.objectness)
 
-    def __getitem__(self, index: Int[np.ndarray, " k"] | slice | list[int]) -> ObjectPosteriors:
+    def __getitem__(self, index: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"] | slice | list[int]) -> ObjectPosteriors:
         """Some of the objects."""
         fields: dict[str, Any] = {}
         for field in dataclasses.fields(self):

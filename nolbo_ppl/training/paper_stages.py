@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -403,6 +404,11 @@ def _model_folder(path: Path) -> Path:
     return path / "model" if (path / "model" / "config.json").is_file() else path
 
 
+def _rows(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    """Rows of a value."""
+    return value[mask]
+
+
 @torch.no_grad()
 def voxel_precision(model: Nolbo, batches: Iterator[SceneBatch]) -> dict[str, float]:
     """Average precision of the voxels that the latent of each held-out object decodes to, at its responsible region: `voxel_map`,
@@ -416,7 +422,7 @@ def voxel_precision(model: Nolbo, batches: Iterator[SceneBatch]) -> dict[str, fl
         mask = scene.assignment.assigned & batch.has_voxels & (batch.category >= 0)
         if not bool(mask.any()):
             continue
-        q = scene.posterior.map(lambda value, mask=mask: value[mask]).at_map_category(model.story.prior.label_mean())
+        q = scene.posterior.map(partial(_rows, mask)).at_map_category(model.story.prior.label_mean())
         probability = torch.sigmoid(model.story.decoder(q.shape_loc)).float().cpu().numpy()
         truth = unpack_voxels(batch.voxels[mask].cpu().numpy(), model.config.voxel_size)
         solid = truth.any(axis=(1, 2, 3))

@@ -17,6 +17,7 @@ from nolbo_ppl.cli.evaluate import EvaluateConfig, measure, metrics, open_scenes
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes
 from nolbo_ppl.evaluation.measure import measure_detections, measure_objects
+from nolbo_ppl.evaluation.model_evaluation import SEED
 from nolbo_ppl.evaluation.scores import REQUIRED, confusion, flipped
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, viewpoint_to_matrix
 from nolbo_ppl.geometry.voxels import pack_voxels, unpack_voxels, voxel_centres
@@ -515,7 +516,7 @@ def scene_folder(tmp_path_factory):
     from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 
     folder = tmp_path_factory.mktemp("scenes") / "set"
-    write_scenes(folder, SceneGenerator(preset("easy", 64), seed=evaluate.SEED), 6)
+    write_scenes(folder, SceneGenerator(preset("easy", 64), seed=SEED), 6)
     return folder
 
 
@@ -528,7 +529,7 @@ def test_folder_and_generated_scenes_are_the_same(scene_folder):
     model_config = dataclasses.replace(tiny(), image_size=64)
     read = open_scenes(config(scenes=scene_folder, count=5), model_config)
     assert isinstance(read, FolderScenes) and len(read) == 5
-    generated = GeneratedScenes(SceneGenerator(preset("easy", 64), seed=evaluate.SEED), 5)
+    generated = GeneratedScenes(SceneGenerator(preset("easy", 64), seed=SEED), 5)
     for index in range(5):
         a, b = read[index], generated[index]
         for name in (*ARRAYS, "intrinsics", "ignore", "voxels", "pixels"):

@@ -249,8 +249,8 @@ class ObservationModel:
             self._shape_hulls,
             guide.sizes if self.device.type == "cpu" else copy.deepcopy(guide.sizes).cpu(),
             1 - encoding.generated.cpu()[row],
-            torch.tensor([image.guessed for image in images])[row],
-            torch.tensor([image.extent for image in images])[row],
+            torch.tensor([image.guessed for image in images], device="cpu")[row],
+            torch.tensor([image.extent for image in images], device="cpu")[row],
         )
 
     def _preprocess_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[PreprocessedImage]:

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from nolbo_ppl.io.images import open_image
+
 LOSSLESS = 100
 """Quality at which nothing is compressed."""
 
@@ -63,4 +65,5 @@ def compressed(image: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndar
         return image
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, "JPEG", quality=quality)
-    return np.asarray(Image.open(stream).convert("RGB"))
+    stream.seek(0)
+    return open_image(stream, label="the compressed image")
