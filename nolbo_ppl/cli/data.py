@@ -76,7 +76,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if args[:1] in (["-h"], ["--help"]):
             sys.stdout.write("usage: nolbo data check [NAME] PATH [--out SHEET.png] [--json]\n\nNAME is one of\n")
             sys.stdout.write("".join(f"  {name:20} {one.what}\n" for name, one in sorted(FORMATS.items())))
-            return
+            raise SystemExit(0)
         raise input_error("nolbo data", got=" ".join(args[:1]) or "nothing", expected="check")
     config = tyro.cli(DataCheckConfig, prog="nolbo data check", args=args[1:], description=__doc__)
     report = run(config)

@@ -34,15 +34,9 @@ class ObserveConfig:
     (frame2 before frame10), the same as in `nolbo odometry` and `nolbo run`."""
     out: Path
     """Folder for observations.jsonl and the pictures."""
-    topic: str | None = None
-    """Topic of the images of a bag; by default its only one. Its camera info gives the camera."""
     model: str = "photo"
     """Name of weights in the package (`photo` for photographs, `tiny` for generated scenes), or a folder with a model of your
     own."""
-    device: str = "auto"
-    """Where the networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
-    bf16: bool = False
-    """Networks in bfloat16."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
     camera: Path | None = None
@@ -58,6 +52,12 @@ class ObserveConfig:
     size: int | None = None
     """Longer side, px, at which the network looks at each image, a multiple of 32; its own by default. Larger for wide
     images whose objects would else be too small."""
+    topic: str | None = None
+    """Topic of the images of a bag; by default its only one. Its camera info gives the camera."""
+    device: str = "auto"
+    """Where the networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
+    bf16: bool = False
+    """Networks in bfloat16."""
 
 
 @dataclass(frozen=True)

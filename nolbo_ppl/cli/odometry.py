@@ -47,8 +47,6 @@ class OdometryRunConfig:
     """Folder of images (KITTI, TUM RGB-D, any names), a video or a bag of ROS (`BAG:/topic`)."""
     out: Path
     """Folder for odometry.txt, odometry_covariance.npz and odometry.json."""
-    topic: str | None = None
-    """Topic of the images of a bag; by default its only one."""
     intrinsics: Path | None = None
     """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, intrinsics.json, a KITTI calib.txt, or a text file with fx fy cx cy
     and the distortion, which is taken out of the images. Without a file the camera is guessed."""
@@ -73,6 +71,8 @@ class OdometryRunConfig:
     """Number of frames; all when left out."""
     config: OdometryConfig = field(default_factory=OdometryConfig)
     """Settings."""
+    topic: str | None = None
+    """Topic of the images of a bag; by default its only one."""
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,6 @@ class RunConfig:
     and depth are named by `BAG:/topic`."""
     out: Path = field(metadata=affects(None))
     """Folder of the run. Stages that are complete in it are not done again."""
-    topic: str | None = field(default=None, metadata=affects("odometry"))
-    """Topic of the images of a bag; by default its only one. Its camera info gives the camera."""
     intrinsics: Path | None = field(default=None, metadata=affects("odometry", "file"))
     """The camera: YAML of OpenCV, ROS, Kalibr or ORB-SLAM, JSON with fx, fy, cx, cy in px of the images, a KITTI calib.txt, or
     numbers. Its distortion is taken out of the images. Without a file the camera is guessed, which makes ranges wrong."""
@@ -108,6 +106,8 @@ class RunConfig:
     """Settings of the visual odometry."""
     slam: SlamConfig = field(default_factory=SlamConfig, metadata=affects("slam"))
     """Settings of the EM."""
+    topic: str | None = field(default=None, metadata=affects("odometry"))
+    """Topic of the images of a bag; by default its only one. Its camera info gives the camera."""
 
     @property
     def refines_by_height(self) -> bool:

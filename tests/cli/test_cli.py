@@ -116,7 +116,7 @@ def test_documented_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
     for document, text in commands:
         verb, *rest = text.split()
         assert verb in VERBS, f"{document}: nolbo {text}"
-        help_of = [verb, rest[0]] if verb == "convert" else [verb]
+        help_of = [verb, rest[0]] if verb in ("convert", "data") else [verb]
         key = " ".join(help_of)
         if key not in helps:
             with pytest.raises(SystemExit):

@@ -47,8 +47,9 @@ def test_every_verb_that_writes_is_struck() -> None:
     from nolbo_ppl.cli import VERBS
 
     struck = {verb.arguments[0] for verb, _ in faults.verbs_of(Path("in"))}
-    # demo calls drive and run; report and curves write one file by `atomic_path`; view writes nothing.
-    assert set(VERBS) - struck == {"demo", "report", "curves", "view"}
+    # demo calls drive and run; report, curves and data write one file by `atomic_path`; view writes nothing. merge and export
+    # write their folder as slam does, by `output_folder`; reproduce trains as train does and writes its tables one by one.
+    assert set(VERBS) - struck == {"demo", "report", "curves", "data", "view", "merge", "export", "reproduce"}
 
 
 def stage_with(tmp_path: Path, said: str) -> faults.Stage:

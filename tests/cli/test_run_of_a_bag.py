@@ -43,7 +43,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_of_a_bag_is_that_of_its_images(drive: Path, tmp_path: Path) -> None:
-    same = {"sizes": (96,), "report": False, "threshold": 0.6}
+    same = {"test_sizes": (96,), "report": False, "score_threshold": 0.6}
     bag = drive / "bag"
     config = RunConfig(bag, tmp_path / "bag", topic="/camera/image", odometry=Path(f"{bag}:/odom"), mcap=True, **same)
     of_bag = run_pipeline(config)
