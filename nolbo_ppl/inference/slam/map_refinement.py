@@ -169,7 +169,8 @@ def fit_odometry(state: SlamState, rounds: int = 4, tolerance: float = 0.05) -> 
         after = np.array([np.median(state.noise.rotation_step), np.median(state.noise.translation_step)])
         if (np.abs(np.log(after / before)) < tolerance).all():
             break
-        state = solve_clean(state, repeats=1)
+        # The marginals stay: weights by each pair's residual alone count a detection up to four times.
+        state = solve_soft(state)
     return state
 
 
