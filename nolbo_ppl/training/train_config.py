@@ -166,7 +166,7 @@ class TrainConfig:
     """`auto` (a CUDA device where there is one, else Apple's, else the CPU), `cpu`, `cuda`, `cuda:N` or `mps`. A run may go on
     on another one."""
     compile: bool = False
-    """Let torch compile encoder and decoder (`torch.compile`); a GPU gains by it, the CPUs measured do not (docs/training.md)."""
+    """Let torch compile encoder and decoder (`torch.compile`). What it gains has not been measured."""
     prefetch: int = 2
     """Batches prepared ahead of the step that takes them, in page-locked memory for CUDA devices."""
     threads: int = 0
