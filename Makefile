@@ -11,7 +11,7 @@ FUZZ_SECONDS ?= 600
 # Kills, signals and full disks of `make faults`.
 FAULTS ?= 100
 
-.PHONY: setup demo train test lint wheel bench bench-gate docs clean fuzz faults test-lowest test-newest audit
+.PHONY: setup demo train test test-slow lint wheel bench bench-gate docs clean fuzz faults test-lowest test-newest audit
 
 setup: $(STAMP)
 
@@ -27,7 +27,11 @@ train: $(STAMP)
 	$(BIN)/nolbo train --preset nano --out runs/nano --count 1024 --single-steps 0 --shape-steps 150 --scene-steps 400
 
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_WORKERS) -m "not slow"
+
+# Those of more than ten seconds: notebooks, documents, whole runs, two processes.
+test-slow: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_WORKERS) -m slow
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
