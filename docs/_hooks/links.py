@@ -1,4 +1,4 @@
-"""LandmarkEqualities that leave docs/ work on the site as they do in the repository: to tutorials, or to the file's own text."""
+"""Links that leave docs/ work on the site as they do in the repository: to tutorials, or to the file's own text."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ NAMES = {
     "phase": "Phase",
     "log_evidence": "Log evidence, nats",
     "closings": "Loops closed",
-    "links": "LandmarkEqualities",
-    "strong_links": "LandmarkEqualities above one half",
+    "links": "Links",
+    "strong_links": "Links above one half",
     "change": "Cameras moved, m (RMS)",
 }
 """Columns of the table of iterations."""

@@ -101,7 +101,7 @@ def world_map(run: RunFolder) -> str:
 
 
 def loop_closures(run: RunFolder) -> str:
-    """LandmarkEqualities of loops and how many of them are right."""
+    """Links of loops and how many of them are right."""
     if run.associations_in_time is None or not run.landmarks:
         return ""
     if run.associations_in_time.frame is None:

@@ -163,12 +163,8 @@ def find_loop_closure(
 
 
 def windows(first: Int[np.ndarray, " m"], size: int) -> list[Int[np.ndarray, " w"]]:
-    """Groups of tracklets that follow each other in time, each half overlapping the next.
-
-    At most half of all: a group is matched to what lies outside of it, and a small world is a whole one too.
-    """
+    """Groups of tracklets that follow each other in time, each half overlapping the next."""
     order = np.argsort(first, kind="stable")
-    size = min(size, max(len(order) // 2, 2))
     if len(order) <= size:
         return [order] if len(order) else []
     half = max(size // 2, 1)

@@ -51,9 +51,9 @@ class EmStepInfo:
     closings: int
     """Constellations accepted."""
     links: int
-    """LandmarkEqualities in the M-step."""
+    """Equalities of landmarks in the M-step."""
     strong_links: int
-    """LandmarkEqualities that merge tracklets."""
+    """Equalities that merge tracklets."""
     change: float
     """Root mean square change of the camera positions, m."""
     graph_error: float
@@ -68,7 +68,7 @@ def link_arrays(
     weight: Float[np.ndarray, " l"],
     position_scale: float,
 ) -> LandmarkEqualities:
-    """LandmarkEqualities between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
+    """Equalities between tracklets; where both are oriented, by the mode (flip, symmetry) nearest to the estimate."""
     T = np.tile(np.eye(4), (len(a), 1, 1))
     scale = np.tile([UNINFORMATIVE_ROTATION_SIGMA, position_scale], (len(a), 1))
     both = np.flatnonzero(features.oriented[a] & features.oriented[b] & (features.symmetry[a] != 0) & (features.symmetry[b] != 0))

@@ -25,8 +25,6 @@ from nolbo_ppl.inference.slam.slam_state import SlamState
 
 DRIFT_FACTORS = (1.0, 3.0, 0.5, 6.0)
 """Factors on odometry scales nobody stated with which the runs begin; further runs repeat them."""
-BOLD_LOG_ODDS = 0.25
-"""Share of the evidence a loop must have that a bold run asks for."""
 SAME_MAP = 1.0
 """Runs whose trajectories are closer than this many typical detection scales are one hypothesis."""
 SAME_EVIDENCE = 5.0
@@ -80,7 +78,7 @@ class Run:
     @property
     def closed(self) -> bool:
         """Whether tracks of different passes were joined."""
-        return any(info.strong_links for info in self.infos) or any(info.closings for info in self.infos)
+        return any(info.strong_links or info.closings for info in self.infos)
 
 
 def start_of_run(state: SlamState, k: int) -> SlamState:
@@ -98,9 +96,6 @@ def start_of_run(state: SlamState, k: int) -> SlamState:
     if k % 2:  # a slower start, and more samples
         annealing = (2 * annealing[0], *annealing)
     config = replace(state.config, seed=state.config.seed + 1000 * k, annealing=annealing, samples=2 * state.config.samples)
-    if k % 2:  # bold: two pairs may close a loop, on little evidence; the evidence of the whole map judges it in the end
-        log_odds = BOLD_LOG_ODDS * config.constellation_log_odds
-        config = replace(config, constellation_minimum=2, constellation_log_odds=log_odds)
     return replace(state, noise=noise, config=config)
 
 

@@ -38,7 +38,7 @@ SMALLEST_MARGINAL = 0.01
 
 
 def surviving_landmark_equalities(state: SlamState) -> LandmarkEqualities:
-    """LandmarkEqualities that the robust solution keeps: those it stretches far are contradicted by the rest."""
+    """Equalities that the robust solution keeps: those it stretches far are contradicted by the rest."""
     links = state.links
     position = state.estimate.T_world_landmark[:, :3, 3]
     stretch = np.linalg.norm(position[links.a] - position[links.b], axis=1) / np.maximum(links.scale[:, 1], 1e-12)

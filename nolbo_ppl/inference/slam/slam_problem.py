@@ -138,7 +138,7 @@ class SlamConfig:
     em_iterations: int = 4
     """Iterations of the soft EM between tracklets after that."""
     link_minimum: float = 0.02
-    """LandmarkEqualities of lower weight are left out of the M-step."""
+    """Equalities of two tracklets of lower weight are left out of the M-step."""
     merge_weight: float = 0.5
     """Tracklets linked by more than this become one landmark."""
     robust_width: float = 1.0

@@ -91,7 +91,7 @@ def position_stated(state: SlamState) -> np.ndarray:
 def calibrate(state: SlamState) -> SlamState:
     """Fit position and rotation scales to the residuals about the solved tracks, and account for their correlation.
 
-    Scales nobody stated go up and down. Stated ones are inflated only when they are too small by more than a third (reported)
+    Scales nobody stated go up and down. Stated ones are raised only when they are too small by more than a third (reported)
     and `correct_scales`; too wide ones are reported.
     """
     noise, config = state.noise, state.config
@@ -115,12 +115,10 @@ def calibrate(state: SlamState) -> SlamState:
         report["position_track_width"] = ratio
         change = _change(ratio, "position", stated[rows], config.correct_scales, warnings)
         # Where nobody stated them, directions and depth are told apart: gaps between frames hold the odometry's steps as well.
-        across, along_ray = (np.sqrt(width**2 * used) if np.isfinite(width) else change[1] for width in widths_by_ray(found))
-        free = inflated(
-            noise.position_covariance,
-            state.problem.observations.position,
-            *(max(float(width), MIN_FACTOR) ** 2 for width in (across, along_ray)),
-        )
+        in_use = zip(widths_by_ray(found), (noise.position_factor, noise.range_factor))
+        across, along_ray = (width**2 * own if np.isfinite(width) else change[1] ** 2 for width, own in in_use)
+        least = MIN_FACTOR**2
+        free = inflated(noise.position_covariance, state.problem.observations.position, max(across, least), max(along_ray, least))
         covariance = np.where(stated[:, None, None], noise.position_covariance * change[0] ** 2, free)
         floor = (MIN_RANGE_PART * state.typical_range) ** 2 * np.eye(3)
         covariance = np.where(stated[:, None, None], covariance, covariance + floor)

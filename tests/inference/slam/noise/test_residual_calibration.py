@@ -99,7 +99,16 @@ def test_depth_and_directions_have_scales_of_their_own() -> None:
     position = exact + 0.05 * noise[:, :3] + 0.25 * noise[:, 3:] * ray
     table = replace(table, position=position, position_covariance=np.full((len(table), 3, 3), np.nan))
     state = solve(SlamProblem(drive.odometry, table), SlamConfig(hypotheses=1)).state
-    covariance, seen = state.noise.position_covariance, position / np.linalg.norm(position, axis=1, keepdims=True)
+    # Factors in use are taken off by direction: the answer does not depend on them.
+    for across, along in ((1.0, 1.0), (2.0, 8.0)):
+        noise = replace(state.noise, position_factor=across, range_factor=along)
+        again = calibrate(replace(state, noise=noise)).noise.position_covariance
+        check_ray_scales(again, position)
+    check_ray_scales(state.noise.position_covariance, position)
+
+
+def check_ray_scales(covariance: np.ndarray, position: np.ndarray) -> None:
+    seen = position / np.linalg.norm(position, axis=1, keepdims=True)
     along = np.einsum("ni,nij,nj->n", seen, covariance, seen)
     across = (np.trace(covariance, axis1=1, axis2=2) - along) / 2
     assert np.sqrt(np.median(along)) == pytest.approx(np.hypot(0.25, 0.05), rel=0.3)
