@@ -35,9 +35,6 @@ from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.io.true_objects import TrueObjects
 from nolbo_ppl.metrics.stated_probabilities import log_score, reliability_bins, reliability_gap
 
-MIN_IN_BIN = 50
-"""Bins of reliability with fewer cases are joined to the next."""
-
 
 @dataclass(frozen=True)
 class Kind:
@@ -165,7 +162,10 @@ def share(name: str, column: int, low: float = 0.0, high: float = 1.0) -> Callab
 def table(name: str, rows: list[dict[str, Any]]) -> None:
     """Print the figures of a kind."""
     print(f"\n{name}: {len(rows)} worlds, {np.mean([row['seconds'] for row in rows]):.1f} s each")
-    difference: Callable[[list[dict[str, Any]]], float] = lambda r: mean_of("log_score")(r) - mean_of("log_score_objectness")(r)  # noqa: E731
+
+    def difference(rows: list[dict[str, Any]]) -> float:
+        return mean_of("log_score")(rows) - mean_of("log_score_objectness")(rows)
+
     print(f"  background, log score         {interval(rows, mean_of('log_score'))}")
     print(f"    less that of objectness     {interval(rows, difference)}")
     for which in ("background", "existence", "class", "association"):

@@ -46,8 +46,6 @@ WORDS = (
     b"[[[",
     b"\xff\xfe",
     b"\xe9",
-)
-WORDS += (
     b"\x00",
     b"\n",
     b"\r",
@@ -57,7 +55,7 @@ WORDS += (
     b"../" * 4,
     b"1",
     b"0",
-    b'"a" * 300',
+    b'"' + b"a" * 300 + b'"',
     b"[" * 3000,
     b"PK\x03\x04",
     b"%!PS-Adobe",
@@ -105,6 +103,8 @@ class Surface:
     read: Callable[[Path], Any]
     beside: tuple[tuple[str, bytes], ...] = ()
     """Files that lie beside it."""
+    missing: bool = False
+    """Whether NaN stands for what a file may leave out."""
 
 
 def changed_bytes(data: bytes, rng: random.Random) -> bytes:
@@ -192,15 +192,15 @@ def mutate(surface: Surface, rng: random.Random) -> bytes:
     return changed_bytes(surface.good, rng)
 
 
-def not_finite(value: Any) -> bool:
-    """Whether an array among what was read holds a number that is not finite; NaN stands for missing in detections."""
+def not_finite(value: Any, missing: bool = False) -> bool:
+    """Whether an array among what was read holds a number that is not finite; `missing`: NaN may stand for what is left out."""
     if isinstance(value, np.ndarray) and value.dtype.kind == "f":
-        return bool(np.isinf(value).any())
+        return bool((np.isinf(value) if missing else ~np.isfinite(value)).any())
     if isinstance(value, dict):
-        return any(not_finite(item) for item in value.values())
+        return any(not_finite(item, missing) for item in value.values())
     if isinstance(value, list | tuple):
-        return any(not_finite(item) for item in value)
-    return hasattr(value, "__dict__") and any(not_finite(item) for item in vars(value).values())
+        return any(not_finite(item, missing) for item in value)
+    return hasattr(value, "__dict__") and any(not_finite(item, missing) for item in vars(value).values())
 
 
 class TooSlow(BaseException):
@@ -243,7 +243,7 @@ def judge(surface: Surface, data: bytes, folder: Path) -> str | None:
         return f"more than {SLOWEST} s"
     except Exception as error:
         return f"{type(error).__name__}: {error} at {traceback.format_exc().splitlines()[-3].strip()}"
-    if not_finite(found):
+    if not_finite(found, surface.missing):
         return "a number that is not finite"
     numeric = [str(one.message) for one in told if issubclass(one.category, RuntimeWarning)]
     return f"warning: {numeric[0]}" if numeric else None
@@ -303,7 +303,10 @@ def surfaces() -> list[Surface]:
 
     return [
         Surface(
-            "observations.jsonl", lines([detection, {**detection, "frame": 2, "id": "b"}]), lambda p: read_observations(p, 6)
+            "observations.jsonl",
+            lines([detection, {**detection, "frame": 2, "id": "b"}]),
+            lambda p: read_observations(p, 6),
+            missing=True,
         ),
         Surface("kitti.txt", kitti, read_trajectory),
         Surface("tum.txt", tum, read_trajectory),
@@ -357,7 +360,8 @@ def run_surfaces() -> list[Surface]:
         run = read_run(path.parent)
         return run.estimate, run.iterations, run.landmarks, run.associations
 
-    return [Surface(name, files[name], read, tuple((n, c) for n, c in files.items() if n != name)) for name in files]
+    beside = {name: tuple((other, content) for other, content in files.items() if other != name) for name in files}
+    return [Surface(name, files[name], read, beside[name], missing=True) for name in files]
 
 
 def fuzz(chosen: list[Surface], seconds: float, seed: int, keep: Path | None = None, most: int = 10**9) -> dict[str, Counts]:

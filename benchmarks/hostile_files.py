@@ -18,10 +18,9 @@ import tempfile
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-import faults
 import fuzz
+from forked_verbs import Stage, Verb, heavy_imports
 
-KINDS = {".json": (".json",), ".jsonl": (".jsonl",), ".npz": (".npz",), ".txt": (".txt",)}
 PICTURES = {".png", ".ppm", ".pgm", ".jpg", ".tiff", ".webp"}
 
 
@@ -30,14 +29,14 @@ def read_answers(path: Path, surfaces: list[fuzz.Surface], scratch: Path) -> dic
     data, found = path.read_bytes(), {}
     for surface in surfaces:
         suffix = Path(surface.name).suffix
-        if suffix not in KINDS.get(path.suffix, ()) and not (path.suffix in PICTURES and suffix in PICTURES):
+        if suffix != path.suffix and not {suffix, path.suffix} <= PICTURES:
             continue
         answer = fuzz.judge(surface, data, scratch / "read")
         found[surface.name] = "accepted" if answer is None else (answer and f"DEFECT {answer}") or "clear"
     return found
 
 
-def run_answer(stage: faults.Stage, arguments: list[str], inputs: Path, name: str) -> str:
+def run_answer(stage: Stage, arguments: list[str], inputs: Path, name: str) -> str:
     """Run a command of the command line on a copy of its inputs; paths are taken relative to them."""
     given = stage.scratch / name
     shutil.rmtree(given, ignore_errors=True)
@@ -47,7 +46,7 @@ def run_answer(stage: faults.Stage, arguments: list[str], inputs: Path, name: st
         at = arguments.index("--out")
         arguments = arguments[:at] + arguments[at + 2 :]
     arguments = [str(given / a) if (given / a).exists() else a for a in arguments]
-    status = stage.run(faults.Verb(name, tuple(arguments), f"{name}/out"))
+    status = stage.run(Verb(name, tuple(arguments), f"{name}/out"))
     said = stage.said().strip().splitlines() or [""]
     if "Traceback" in stage.said() or status not in (0, 2):
         return f"DEFECT status {status}: {said[-1]}"
@@ -66,7 +65,7 @@ def run_answer(stage: faults.Stage, arguments: list[str], inputs: Path, name: st
 
 def answers(cases: Path, only: str = "") -> dict[str, str]:
     """Every case and its answer."""
-    faults.heavy_imports({"slam", "observe"})
+    heavy_imports({"slam", "observe"})
     surfaces, found = fuzz.surfaces(), {}
 
     def note(name: str, answer: str) -> None:
@@ -75,7 +74,7 @@ def answers(cases: Path, only: str = "") -> dict[str, str]:
 
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder).resolve()
-        stage = faults.Stage(scratch)
+        stage = Stage(scratch)
         for path in sorted(cases.iterdir()):
             if only and only not in path.name:
                 continue

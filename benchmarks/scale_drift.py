@@ -52,7 +52,7 @@ class Arguments:
 
 
 def simulated(seed: int) -> SimulatedSequence:
-    """A circuit of two laps with 50 objects."""
+    """A circuit of two laps with 40 objects."""
     rng = np.random.default_rng(seed)
     truth = simulate_circuit(rng, frames_per_lap=60, radius=32.0)
     world = simulate_world(truth, WorldConfig(objects=40), rng)

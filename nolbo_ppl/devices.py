@@ -93,7 +93,7 @@ def each_pinned(batches: Iterator[T], device: torch.device) -> Iterator[T]:
 
 
 def peak_memory(device: torch.device) -> int | None:
-    """Most memory, bytes, that tensors held on a CUDA device since `reset_peak`; None on others."""
+    """Most memory, bytes, that tensors held on a CUDA device since `torch.cuda.reset_peak_memory_stats`; None on others."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
 
 

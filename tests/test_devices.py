@@ -71,10 +71,9 @@ def on_fake(model: Nolbo, batch: Any) -> tuple[Nolbo, Any]:
 
 def test_names_of_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     assert device_of("cpu") == torch.device("cpu") and device_of(torch.device("meta")).type == "meta"
-    for wrong in ("gpu", "cuda:x", "cuda:", "cpu:1", "", "mps:0"):
-        if wrong != "cuda:":
-            with pytest.raises(InputError, match="device"):
-                device_of(wrong)
+    for wrong in ("gpu", "cuda:x", "cpu:1", "", "mps:0"):
+        with pytest.raises(InputError, match="device"):
+            device_of(wrong)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     assert device_of("auto") == torch.device("cpu")

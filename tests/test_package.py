@@ -80,6 +80,17 @@ def test_imports_run_downwards(path: Path) -> None:
         assert layer_of(module) <= layer_of(name), f"{name} imports {module}"
 
 
+def test_the_drawn_tree_is_the_tree() -> None:
+    """Rooms in the order of the layers, and modules at the top."""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").split("```")[1]
+    rooms = [name for layer in reversed(LAYERS) for name in layer if (PACKAGE / name).is_dir()]
+    assert re.findall(r"^  (\w+)/", text, re.MULTILINE) == [*rooms, "weights"]
+    modules = {path.name for path in PACKAGE.glob("*.py")} - {"__init__.py", "__main__.py"}
+    assert set(re.findall(r"\w+\.py", text)) == modules
+    inner = {path.parent.name for path in (PACKAGE / "inference").glob("*/**/__init__.py")}
+    assert inner == set(re.findall(r"(\w+)/", text.partition("  inference/")[2].partition("\n  models/")[0]))
+
+
 def test_the_check_of_imports_sees_an_import() -> None:
     assert "nolbo_ppl.models.observation_model" in imported(PACKAGE / "training" / "trainer.py")
     assert layer_of("nolbo_ppl.cli.train") > layer_of("nolbo_ppl.models.observation_model")
@@ -197,7 +208,7 @@ def test_links_at_the_root_are_relative() -> None:
         assert os.readlink(ROOT / name) == f"nolbo_ppl/{name}"
 
 
-TEXT = {".py", ".md", ".toml", ".json", ".jsonl", ".cff", ".txt", ""}
+TEXT = {".py", ".md", ".toml", ".yml", ".yaml", ".json", ".jsonl", ".cff", ".txt", ""}
 
 
 def tracked() -> list[Path]:

@@ -43,6 +43,7 @@ def is_clear(path: Path) -> None:
         (is_unclear, "error without the file"),
         (is_clear, ""),
         (lambda _: {"a": [np.array([1.0, np.inf])]}, "not finite"),
+        (lambda _: (np.array([1.0, np.nan]),), "not finite"),
         (lambda _: np.exp(np.array(1e6)) * 0 + 1, "warning: overflow"),
         (lambda _: np.zeros(2), None),
     ],
@@ -50,6 +51,11 @@ def is_clear(path: Path) -> None:
 def test_the_judge_sees_each_kind_of_defect(read: object, answer: str | None, tmp_path: Path) -> None:
     found = fuzz.judge(fuzz.Surface("x.json", b"{}", read), b"{}", tmp_path / "x")
     assert found == answer if answer in ("", None) else answer in (found or "")
+
+
+def test_missing_numbers_are_no_defects_where_a_file_may_leave_them_out(tmp_path: Path) -> None:
+    surface = fuzz.Surface("x.json", b"{}", lambda _: np.array([1.0, np.nan]), missing=True)
+    assert fuzz.judge(surface, b"{}", tmp_path / "x") is None
 
 
 def test_slow_readers_are_defects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,6 +23,7 @@ from nolbo_ppl.io.output_folder import contents, output_folder
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 import faults
+from forked_verbs import Stage, Verb, verbs_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("--frames", "12", "--laps", "1", "--radius", "6", "--world.objects", "4")
@@ -46,19 +47,19 @@ def test_no_fault_breaks_a_verb(tmp_path: Path) -> None:
 def test_every_verb_that_writes_is_struck() -> None:
     from nolbo_ppl.cli import VERBS
 
-    struck = {verb.arguments[0] for verb, _ in faults.verbs_of(Path("in"))}
+    struck = {verb.arguments[0] for verb, _ in verbs_of(Path("in"))}
     # demo calls drive and run; report, curves and data write one file by `atomic_path`; view writes nothing. merge and export
     # write their folder as slam does, by `output_folder`; reproduce trains as train does and writes its tables one by one.
     assert set(VERBS) - struck == {"demo", "report", "curves", "data", "view", "merge", "export", "reproduce"}
 
 
-def stage_with(tmp_path: Path, said: str) -> faults.Stage:
-    stage = faults.Stage(tmp_path)
+def stage_with(tmp_path: Path, said: str) -> Stage:
+    stage = Stage(tmp_path)
     stage.text = said
     return stage
 
 
-VERB = faults.Verb("v", ("v",))
+VERB = Verb("v", ("v",))
 SAID = "nolbo v: out of luck\n"
 
 
