@@ -17,6 +17,7 @@ from scipy.special import gammainc
 from nolbo_ppl.geometry.pose import inverse, relative, se3_log, so3_exp, so3_log
 from nolbo_ppl.inference.slam import SlamResult
 from nolbo_ppl.io.true_objects import CLUTTER, UNKNOWN, TrueObjects
+from nolbo_ppl.metrics.association import normalised_error_squared
 from nolbo_ppl.metrics.stated_probabilities import probability_record, region_record
 from nolbo_ppl.metrics.trajectory import known_rows
 
@@ -91,6 +92,8 @@ def class_cases(result: SlamResult, object_of: Int[np.ndarray, " k"], category: 
 def association_cases(result: SlamResult, object_of: Int[np.ndarray, " k"], few: bool = False) -> Cases:
     """Probability of every listed pair of a detection and a landmark, and whether its object is that of the landmark's others.
 
+    Detections of which nobody knows what they are of neither count nor say what the landmark is.
+
     Args:
         result: the answer.
         object_of: true object of each detection.
@@ -104,7 +107,7 @@ def association_cases(result: SlamResult, object_of: Int[np.ndarray, " k"], few:
     for j, mine in zip(names, np.split(order, start[1:])):
         of, weight = object_of[found.row[mine]], found.weight[mine]
         for k in range(len(mine)):
-            others = np.arange(len(mine)) != k
+            others = (np.arange(len(mine)) != k) & (of != UNKNOWN)
             if of[k] == UNKNOWN or not others.any():
                 continue
             objects, inverse_index = np.unique(of[others], return_inverse=True)
@@ -132,16 +135,12 @@ def pose_regions(result: SlamResult, truth: Float[np.ndarray, "n 4 4"], every: i
     rows = rows[known[rows]]
     moved = world_of_truth(result, truth) @ truth[rows]
     error = se3_log(relative(result.T_world_camera[rows], moved))
-    return Regions(_squared(error, result.pose_covariances(rows)), 6)
+    return Regions(6 * normalised_error_squared(error, result.pose_covariances(rows)), 6)
 
 
 def world_of_truth(result: SlamResult, truth: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "4 4"]:
     """The truth's world in the answer's, by the first pose, which the covariances hold fixed."""
     return np.asarray(result.T_world_camera[0] @ inverse(truth[0]))
-
-
-def _squared(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
 
 
 def landmark_regions(result: SlamResult, objects: TrueObjects, T_world_truth: Float[np.ndarray, "4 4"]) -> dict[str, Regions]:

@@ -102,18 +102,12 @@ def score_intervals(
         "voxel_ap": pooled(objects.voxel_ap),
         "ece_objectness": _objectness_error(found, weights),
         "ece_class": _class_error(objects, weights),
-        "coverage90_orientation": pooled(inside(objects.azimuth_mass), proportion=True),
-        "coverage90_tilt": pooled(inside(objects.tilt_mass), proportion=True),
-        "coverage90_position": pooled(inside(objects.position_mass), proportion=True),
-        "coverage90_latent": pooled(inside(objects.latent_mass), proportion=True),
-        "azimuth_log_score": pooled(-objects.azimuth_log_density),
+        **calibration_estimates(objects, found.select(judged(found)), weights, rng),
         "azimuth_crps_deg": pooled(np.degrees(objects.azimuth_crps)),
         "median_range_error": pooled(objects.range_error, median=True),
         "median_depth_error": pooled(objects.depth_error, median=True),
         "median_depth_error_known_size": pooled(objects.sized_depth_error, median=True),
     }
-    for name, value in calibration_estimates(objects, found.select(judged(found)), weights, rng).items():
-        result.setdefault(name, value)
     assert set(REQUIRED) <= set(result)
     return result
 

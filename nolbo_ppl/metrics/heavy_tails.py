@@ -18,7 +18,7 @@ from scipy.stats import f
 from nolbo_ppl.errors import input_error
 
 GAUSSIAN_DOF = 1e4
-"""Degrees of freedom that stand for a Gaussian: the log density differs by less than 1e-3 within five scales."""
+"""Degrees of freedom that stand for a Gaussian: the log density differs by less than 0.013 within five scales."""
 DOF_LIMITS = (1.5, GAUSSIAN_DOF)
 """Least and largest degrees of freedom of a fit; with less than two the variance does not exist."""
 

@@ -66,7 +66,9 @@ def log_score(stated: Float[np.ndarray, " n"], happened: Outcomes) -> float:
 def reliability_bins(
     stated: Float[np.ndarray, " n"], happened: Outcomes, bins: int = 10, least: int = MIN_IN_BIN
 ) -> tuple[ReliabilityBin, ...]:
-    """Bins of equal width, those of fewer than `least` cases joined to the next; the last ones alone where they are all there is.
+    """Bins of equal width, those of fewer than `least` cases joined to the next.
+
+    What is left at the end with fewer than `least` cases is left out, unless it is all there is.
 
     Raises:
         InputError: as `log_score`.
@@ -105,9 +107,7 @@ def null_calibration_error(
     return np.array([expected_calibration_error(p, rng.random(len(p)) < p, bins=bins)[0] for _ in range(draws)])
 
 
-def debiased_calibration_error(
-    confidence: Float[np.ndarray, " n"], outcome: Bool[np.ndarray, " n"] | Float[np.ndarray, " n"], bins: int = BINS
-) -> float:
+def debiased_calibration_error(confidence: Float[np.ndarray, " n"], outcome: Outcomes, bins: int = BINS) -> float:
     """Root of the squared calibration error less the part that noise makes (Bröcker 2012; Kumar et al. 2019, section 4).
 
     In each bin the squared gap of means is above its true value by the variance of the frequency, estimated without bias by

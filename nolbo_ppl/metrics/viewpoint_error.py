@@ -43,8 +43,8 @@ def rotation_error(
 def _axis_angle(relative: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """Angle between the vertical axes of two frames, accurate at both ends."""
     across = np.hypot(relative[:, 0, 2], relative[:, 1, 2])
-    azimuth: np.ndarray = np.arctan2(across, relative[:, 2, 2])
-    return azimuth
+    angle: np.ndarray = np.arctan2(across, relative[:, 2, 2])
+    return angle
 
 
 def _least_angle(relative: Float[np.ndarray, "n 3 3"], order: int) -> Float[np.ndarray, " n"]:

@@ -151,9 +151,9 @@ class DriveScores:
     rpe: float
     """m over one step."""
     loop_recall: float
-    """Share of loop pairs of detections of one object that are put on one landmark; NaN for odometry alone."""
+    """Share of loop pairs of detections of one object that are put on one landmark; NaN for odometry alone, or without a pair."""
     loop_precision: float
-    """Share of the loop pairs put on one landmark that are one object; NaN for odometry alone."""
+    """Share of the loop pairs put on one landmark that are one object; NaN for odometry alone, or where none was put."""
 
 
 def odometry_of(drive: Drive, seed: int) -> Float[np.ndarray, "n 4 4"]:
@@ -184,7 +184,9 @@ def score_slam(drive: Drive, odometry: Float[np.ndarray, "n 4 4"], detections: D
     errors = trajectory_errors(result.T_world_camera, drive.T_world_camera)
     landmark = association_table(result).landmark_of
     pairs = association_pairs(detections.frame, true_objects(detections, drive), landmark, LOOP_GAP)
-    return DriveScores(errors["ate"], errors["rpe_translation"], pairs.recall, pairs.precision)
+    recall = pairs.recall if pairs.true_pairs else np.nan
+    precision = pairs.precision if pairs.found_pairs else np.nan
+    return DriveScores(errors["ate"], errors["rpe_translation"], recall, precision)
 
 
 def scores_of(config: ReproduceConfig, drive: Drive, name: str, seed: int) -> DriveScores:

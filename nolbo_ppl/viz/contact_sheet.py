@@ -10,13 +10,14 @@ from PIL import Image, ImageDraw
 
 from nolbo_ppl.data.format_registry import LabelledPicture
 from nolbo_ppl.io.files import atomic_path
+from nolbo_ppl.viz.style import category_colour
 
 TILE = (320, 240)
 """Width and height of a picture on the sheet, px."""
 LINE = 14
 """Height of its name, px."""
 COLUMNS = 4
-COLOURS = ((230, 75, 53), (77, 187, 213), (0, 160, 135), (243, 155, 127), (132, 145, 180), (145, 209, 194), (220, 0, 0))
+"""Pictures side by side."""
 
 
 def contact_sheet(pictures: Iterable[LabelledPicture]) -> Image.Image | None:
@@ -42,7 +43,7 @@ def _tile(one: LabelledPicture) -> Image.Image:
     names = sorted(set(one.labels))
     for box, label in zip(np.nan_to_num(one.boxes), one.labels):
         x0, y0, x1, y1 = (float(v) * scale for v in box)
-        colour = COLOURS[names.index(label) % len(COLOURS)]
+        colour = category_colour(label, names)
         draw.rectangle((x0, y0 + LINE, max(x1, x0), max(y1, y0) + LINE), outline=colour, width=2)
         draw.text((x0 + 3, y0 + LINE + 2), label.encode("ascii", "replace").decode(), fill=colour)
     return tile

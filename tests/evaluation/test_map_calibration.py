@@ -77,6 +77,14 @@ def test_association_is_right_where_the_other_detections_are_of_that_object(
     stated, right = association_cases(result, of)
     np.testing.assert_allclose(sorted(zip(stated, right)), sorted(expected))
     assert right[stated > 0.9].mean() > 0.8
+    # Detections nobody knows have no say: with all but two of a landmark unknown, the two stand against each other.
+    j = int(np.argmax(np.bincount(found.landmark)))
+    mine = found.row[(found.landmark == j) & (of[found.row] == landmark_objects(result, of)[0][j]) & (found.weight > 0.5)][:2]
+    assert len(mine) == 2
+    few = np.full(len(of), UNKNOWN)
+    few[mine] = of[mine]
+    stated, right = association_cases(result, few)
+    assert right[stated > 0.5].tolist() == [1.0, 1.0]
 
 
 def test_regions_are_those_of_the_stated_covariances(solved: tuple[SimulatedSequence, SlamResult, TrueObjects]) -> None:

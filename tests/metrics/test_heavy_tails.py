@@ -33,7 +33,7 @@ def test_density_is_scipys(dof: float, spread: float) -> None:
 
 def test_many_degrees_of_freedom_are_a_gaussian() -> None:
     s = np.linspace(0, 25, 20)
-    np.testing.assert_allclose(student_log_density(s, 1.7, GAUSSIAN_DOF), -0.5 * (s + 1.7), atol=0.04)
+    np.testing.assert_allclose(student_log_density(s, 1.7, GAUSSIAN_DOF), -0.5 * (s + 1.7), atol=0.013)
     np.testing.assert_allclose(student_log_density(s, 1.7, 1e8), -0.5 * (s + 1.7), atol=1e-5)
 
 

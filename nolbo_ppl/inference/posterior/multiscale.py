@@ -39,7 +39,7 @@ class MultiScalePredictor:
         if not sizes or any(size <= 0 or size % 32 for size in sizes):
             raise input_error("sizes of the images", got=tuple(sizes), expected="positive multiples of 32, one or more")
         self.model, self.sizes = model, tuple(sorted(set(sizes)))
-        self.config = model.config
+        self.config, self.calibration = model.config, model.calibration
         self.decode, self.shape_posterior, self.prior_mean = model.decode, model.shape_posterior, model.prior_mean
 
     def observe(

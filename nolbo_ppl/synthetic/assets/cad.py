@@ -19,7 +19,7 @@ from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.synthetic.assets.cad_mesh import Faces, GridSolid, Vertices, mesh_to_shape
 from nolbo_ppl.synthetic.assets.cad_sizes import TYPICAL_DIAGONAL
 from nolbo_ppl.synthetic.assets.face_colours import PLAIN, Colours, obj_colours, trimesh_colours
-from nolbo_ppl.synthetic.assets.obj_file import read_obj_mesh
+from nolbo_ppl.synthetic.assets.obj_file import read_obj, read_obj_mesh
 from nolbo_ppl.synthetic.assets.off_file import read_off
 from nolbo_ppl.synthetic.assets.sh3f_file import MAXIMUM_BYTES, load_sh3f
 from nolbo_ppl.synthetic.shapes.canonical_shape import Shape
@@ -186,7 +186,7 @@ def _split_name(stem: str, file: Path) -> tuple[str, str]:
 
 def _read_mesh(file: Path) -> tuple[Vertices, Faces]:
     """Read one mesh; the parts of a scene are joined in their places. Raises `InputError` naming the file."""
-    return _read_coloured(file)[:2]
+    return read_obj(file) if file.suffix.lower() == ".obj" else _read_coloured(file)[:2]  # textures of OBJ files are other files
 
 
 def _read_coloured(file: Path) -> tuple[Vertices, Faces, Colours | None]:

@@ -11,13 +11,14 @@ import os
 import posixpath
 import re
 import zipfile
+import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.errors import InputError, input_error
+from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import existing_file
 from nolbo_ppl.synthetic.assets.cad_mesh import mesh_to_shape
 from nolbo_ppl.synthetic.assets.face_colours import obj_colours
@@ -92,7 +93,8 @@ def load_sh3f(
     try:
         with zipfile.ZipFile(file) as archive:
             shapes = list(_shapes(archive, file, CATEGORIES if categories is None else categories, max_faces))
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError) as error:  # damaged, encrypted, unknown packing
+    # damaged, encrypted, packed in another way
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError) as error:
         raise input_error("not a furniture library", got=error, expected="a ZIP archive with a catalogue", file=file) from None
     if not shapes:
         raise input_error("no model of the wanted categories", expected=", ".join(sorted(WORDS)), file=file)
@@ -170,6 +172,6 @@ def _placed(vertices: np.ndarray, entry: dict[str, str], size: np.ndarray, numbe
             ) from None
     turned = vertices @ (TO_CANONICAL @ rotation).T
     if not len(turned) or not np.isfinite(turned).all():
-        raise InputError(f"{file}: entry {number} has no finite vertex")
+        raise input_error(f"model of entry {number}", got="vertices: none, or not finite", expected="finite numbers", file=file)
     extent = np.ptp(turned, axis=0)
     return turned * np.where(extent > 1e-9 * extent.max(), size / np.maximum(extent, 1e-30), 1.0)

@@ -47,7 +47,7 @@ def answers(box, objectness, mark):
 class Eyes:
     """Answers with every box (or those asked for), marked by the size it looked at."""
 
-    decode = shape_posterior = prior_mean = None
+    decode = shape_posterior = prior_mean = calibration = None
 
     def __init__(self, objectness):
         self.config, self.objectness, self.asked = dataclasses.replace(tiny(), image_size=128), objectness, []
@@ -105,7 +105,9 @@ def test_a_pyramid_of_one_size_answers_as_the_model_does():
     image = np.random.default_rng(0).integers(0, 256, (128, 128, 3), dtype=np.uint8)
     box = np.array([[10, 20, 60, 70], [50, 50, 90, 120.0]])
     plain, level = model.observe_boxes([image], None, [box], decode=False)[0], None
-    level = MultiScalePredictor(model, (128,)).observe_boxes([image], None, [box], decode=False)[0]
+    pyramid = MultiScalePredictor(model, (128,))
+    assert pyramid.calibration is model.calibration  # the law of the positions that an evaluation judges
+    level = pyramid.observe_boxes([image], None, [box], decode=False)[0]
     for field in dataclasses.fields(ObjectPosteriors):
         a, b = getattr(plain, field.name), getattr(level, field.name)
         if isinstance(a, np.ndarray):

@@ -180,6 +180,14 @@ def test_damaged_libraries_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             load_cad_folder(library(tmp_path / f"{name}.sh3f", CATALOGUE.replace(old, new)))
+    torn, name = tmp_path / "torn.sh3f", "PluginFurnitureCatalog.properties"
+    with zipfile.ZipFile(torn, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, CATALOGUE)
+    data = bytearray(torn.read_bytes())
+    data[30 + len(name)] = 0xFF  # the first packed byte, behind the header of 30 bytes: no such kind of block
+    torn.write_bytes(data)
+    with pytest.raises(InputError, match="not a furniture library"):
+        load_cad_folder(torn)
     with zipfile.ZipFile(tmp_path / "empty.sh3f", "w") as archive:
         archive.writestr("other", "")
     with pytest.raises(InputError, match="without a catalogue"):
