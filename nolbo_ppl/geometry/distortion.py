@@ -202,5 +202,5 @@ def undistort_depth(
     zoom = np.ones(4) if size is None else np.tile([own[0] / size[0], own[1] / size[1]], 2)
     new = intrinsics if target is None else target
     maps = _maps(tuple((intrinsics * zoom).tolist()), tuple((new * zoom).tolist()), own, model, tuple(coefficients))
-    values = np.nan_to_num(np.asarray(depth, dtype=np.float32), nan=0.0)
+    values = np.nan_to_num(np.asarray(depth, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     return cv2.remap(values, maps[0], maps[1], cv2.INTER_NEAREST).astype(np.float64)

@@ -36,15 +36,16 @@ def decode_counts(text: str) -> Int[np.ndarray, " r"]:
     more follow; from the fourth run on, the difference from the run two before it is written.
 
     Raises:
-        InputError: characters of another kind, or a string that ends within a number.
+        InputError: characters of another kind, a string that ends within a number, or a run longer than a mask may be.
 
     Example:
         >>> decode_counts("04").tolist(), decode_counts("T14").tolist()
         ([0, 4], [36, 4])
     """
-    codes = np.frombuffer(text.encode(), dtype=np.uint8).astype(np.int64) - 48
+    codes = np.frombuffer(text.encode(errors="surrogatepass"), dtype=np.uint8).astype(np.int64) - 48
     if len(codes) and (codes.min() < 0 or codes.max() > 63 or codes[-1] & 32):
         raise input_error("run lengths of a mask", got=repr(text[:40]), expected="COCO's compressed string")
+    beyond = input_error("run lengths of a mask", got=repr(text[:40]), expected=f"runs of at most {MAXIMUM_PIXELS} pixels")
     counts: list[int] = []
     value, shift = 0, 0
     for code in codes.tolist():
@@ -52,12 +53,14 @@ def decode_counts(text: str) -> Int[np.ndarray, " r"]:
         shift += 5
         if code & 32:
             if shift > 60:
-                raise input_error("run lengths of a mask", got=repr(text[:40]), expected="numbers below 2^31")
+                raise beyond
             continue
         if code & 16:
             value -= 1 << shift  # two's complement
         if len(counts) > 2:
             value += counts[-2]
+        if abs(value) > MAXIMUM_PIXELS:  # sums of longer runs leave 64 bits
+            raise beyond
         counts.append(value)
         value, shift = 0, 0
     return np.array(counts, dtype=np.int64)

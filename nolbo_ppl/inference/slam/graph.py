@@ -7,6 +7,7 @@ sit in the noise models (scale / sqrt(w)) and are frozen while the graph is solv
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -174,6 +175,11 @@ def odometry_factors(problem: SlamProblem, noise: NoiseModel) -> gtsam.Nonlinear
     return graph
 
 
+def odometry_rows(steps: int, noise: NoiseModel) -> int:
+    """Rows that `odometry_factors` of so many steps take in the linearised graph; observations come behind them."""
+    return 6 * (steps + 1) + (0 if noise.scale_walk is None else steps)
+
+
 def add_observation_factors(
     graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3, robust_width: float | None = None
 ) -> None:
@@ -315,18 +321,22 @@ class Linearisation:
         noise = rng.standard_normal((self.jacobian.shape[0], count))
         return noise - self.jacobian @ self.factor.solve(self.jacobian.T @ noise)
 
+    def _inverse_columns(self, columns: Int[np.ndarray, " c"]) -> Iterator[tuple[slice, Float[np.ndarray, "s p"]]]:
+        """Columns of the inverse of the normal matrix, 64 blocks of six at a time, with the slice of `columns` that they are."""
+        for start in range(0, len(columns), 384):
+            part = slice(start, min(start + 384, len(columns)))
+            right = np.zeros((self.jacobian.shape[1], part.stop - start))
+            right[columns[part], np.arange(part.stop - start)] = 1.0
+            yield part, self.factor.solve(right)
+
     def covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 6"]:
         """Marginal covariances of the given blocks (landmark j: j; pose i: landmarks + i)."""
+        blocks = np.asarray(blocks, dtype=np.int64)
+        columns = 6 * blocks[:, None] + np.arange(6)
         out = np.empty((len(blocks), 6, 6))
-        size = self.jacobian.shape[1]
-        for start in range(0, len(blocks), 64):
-            chunk = np.asarray(blocks[start : start + 64])
-            right = np.zeros((size, 6 * len(chunk)))
-            columns = (6 * chunk[:, None] + np.arange(6)).ravel()
-            right[columns, np.arange(len(columns))] = 1.0
-            solution = self.factor.solve(right)
-            for k, block in enumerate(chunk):
-                out[start + k] = solution[6 * block : 6 * block + 6, 6 * k : 6 * k + 6]
+        for part, solution in self._inverse_columns(columns.ravel()):
+            own = np.arange(part.start, part.stop).reshape(-1, 6)
+            out[own[:, 0] // 6] = solution[columns[own[:, 0] // 6][:, :, None], own[:, None] - part.start]
         return 0.5 * (out + np.swapaxes(out, 1, 2))
 
     def joint_covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 b 6"]:
@@ -334,22 +344,16 @@ class Linearisation:
         blocks = np.asarray(blocks, dtype=np.int64)
         columns = (6 * blocks[:, None] + np.arange(6)).ravel()
         out = np.empty((len(columns), len(columns)))
-        for start in range(0, len(columns), 384):
-            part = columns[start : start + 384]
-            right = np.zeros((self.jacobian.shape[1], len(part)))
-            right[part, np.arange(len(part))] = 1.0
-            out[:, start : start + 384] = self.factor.solve(right)[columns]
+        for part, solution in self._inverse_columns(columns):
+            out[:, part] = solution[columns]
         return (0.5 * (out + out.T)).reshape(len(blocks), 6, len(blocks), 6)
 
     def scale_deviations(self) -> Float[np.ndarray, " n-1"]:
         """Standard deviations of the scales of the odometry's steps; none where they are no state."""
         first, size = 6 * (self.landmarks + self.poses), self.jacobian.shape[1]
         variance = np.empty(size - first)
-        for start in range(first, size, 384):
-            columns = np.arange(start, min(start + 384, size))
-            right = np.zeros((size, len(columns)))
-            right[columns, np.arange(len(columns))] = 1.0
-            variance[columns - first] = self.factor.solve(right)[columns, np.arange(len(columns))]
+        for part, solution in self._inverse_columns(np.arange(first, size)):
+            variance[part] = solution[first:][part].diagonal()
         return np.sqrt(np.maximum(variance, 0.0))
 
     def log_determinant(self) -> float:

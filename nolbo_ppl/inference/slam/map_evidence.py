@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.geometry.pose import inverse, relative, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_latent, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, linearise
+from nolbo_ppl.inference.slam.graph import Linearisation, linearise, odometry_rows
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -30,11 +30,12 @@ def map_log_evidence(state: SlamState) -> float:
     """
     linearisation = linearise(base_graph(state), state.estimate)
     steps = len(state.problem) - 1
-    # Behind the odometry's rows those of the walk of its scales, where they are a state.
-    odometry = linearisation.residual[: 6 * (steps + 1) + (0 if state.estimate.scale is None else steps)]
+    odometry = linearisation.residual[: odometry_rows(steps, state.noise)]
     value = -0.5 * float(odometry @ odometry) - 3 * float(
         np.sum(np.log(state.noise.rotation_step)) + np.sum(np.log(state.noise.translation_step))
     )
+    if state.noise.scale_walk is not None:
+        value -= max(steps - 1, 0) * float(np.log(state.noise.scale_walk))
     oriented = state.features.oriented
     value += -0.5 * _log_determinant(linearisation, oriented) + 1.5 * (len(oriented) + oriented.sum()) * LOG_2PI
     value += len(oriented) * np.log(state.noise.new_rate) + oriented.sum() * UNIFORM_LOG_DENSITY

@@ -108,8 +108,8 @@ class Tracker:
 
     def _log_odds(self, seen: Measurements, modes: OrientationModes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of detections and tracks inside the gate and their log odds: density over that of any object, per m^3."""
-        traces = (GATE * np.trace(covariance, axis1=1, axis2=2) for covariance in (seen.covariance, self.covariance))
-        k, j = near_pairs(seen.position, next(traces), self.mean, next(traces))
+        seen_reach, track_reach = (GATE * np.trace(S, axis1=1, axis2=2) for S in (seen.covariance, self.covariance))
+        k, j = near_pairs(seen.position, seen_reach, self.mean, track_reach)
         square, log_det = squared_distance(seen.position[k] - self.mean[j], seen.covariance[k] + self.covariance[j])
         inside = square < GATE
         k, j = k[inside], j[inside]

@@ -29,7 +29,9 @@ from nolbo_ppl.inference.slam import (
     solve,
     solve_with_associations,
 )
-from nolbo_ppl.inference.slam.graph import pose_key
+from nolbo_ppl.inference.slam.graph import pose_key, to_values
+from nolbo_ppl.inference.slam.map_evidence import map_log_evidence
+from nolbo_ppl.inference.slam.noise.fitted_residuals import fitted_residuals, whole_graph
 from nolbo_ppl.inference.slam.noise.odometry_scale import rescaled, scale_profile, smooth
 from nolbo_ppl.inference.slam.scale_state import scale_key, scaled_step_factor
 from nolbo_ppl.inference.slam.slam_state import given_odometry
@@ -102,6 +104,15 @@ def test_smoothing_equals_the_sum_over_all_paths() -> None:
     np.testing.assert_allclose(evidence, np.log(total), rtol=1e-12)
 
 
+def test_a_jump_of_the_scale_leaves_numbers() -> None:
+    """Windows that are sure of scales far apart: the walk allows neither, and the answer is each window's own."""
+    grid = np.arange(-1.0, 1.01, 0.01)
+    peaks = np.array([-0.9, -0.9, 0.9, 0.9])
+    posterior, evidence = smooth(-1e4 * (grid - peaks[:, None]) ** 2, grid, 0.007)
+    assert np.isfinite(evidence)
+    np.testing.assert_allclose(posterior @ grid, peaks, atol=0.02)
+
+
 def test_neighbouring_frames_tell_the_scale_in_any_unit() -> None:
     world = drive(seed=3)
     problem = SlamProblem(world.odometry, world.observations)
@@ -138,6 +149,29 @@ def test_scale_is_stated_with_its_uncertainty(solved: tuple[SimulatedSequence, S
     marginals = gtsam.Marginals(result.graph, result.values)
     for i in (0, 17, len(deviations) - 1):
         assert deviations[i] == pytest.approx(np.sqrt(marginals.marginalCovariance(scale_key(i))[0, 0]), rel=1e-6)
+
+
+def test_residuals_of_detections_are_read_behind_those_of_the_scales(solved: tuple[SimulatedSequence, SlamResult]) -> None:
+    """Squares of each factor between a pose and a landmark, by GTSAM one by one."""
+    state = solved[1].state
+    found = fitted_residuals(state, np.random.default_rng(0))
+    graph, factors = whole_graph(state)
+    values = to_values(state.estimate)
+    each = [graph.at(k) for k in range(graph.size())]
+    kinds = ["".join(chr(gtsam.Symbol(key).chr()) for key in factor.keys()) for factor in each]  # noqa: SIM118 - no mapping
+    errors = [factor.error(values) for factor, kind in zip(each, kinds) if kind == "xl"]
+    sure = factors.weight[factors.weight > 1e-3] > 0.5
+    assert len(errors) == len(sure) and found.oriented.all()
+    np.testing.assert_allclose(0.5 * np.sum(found.observation**2, axis=1), np.array(errors)[sure], rtol=1e-6, atol=1e-9)
+
+
+def test_evidence_of_an_ever_narrower_walk_is_that_of_one_scale(solved: tuple[SimulatedSequence, SlamResult]) -> None:
+    """Walks too narrow to matter explain alike: the density of the walk is normalised (each step else gained ln 10)."""
+    state = solved[1].state
+    assert state.estimate.scale is not None
+    even = replace(state, estimate=replace(state.estimate, scale=np.full_like(state.estimate.scale, state.estimate.scale.mean())))
+    values = [map_log_evidence(replace(even, noise=replace(even.noise, scale_walk=walk))) for walk in (1e-5, 1e-6)]
+    assert values[0] == pytest.approx(values[1], abs=0.5)
 
 
 def test_without_drift_nothing_is_scaled() -> None:

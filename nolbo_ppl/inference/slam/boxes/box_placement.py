@@ -55,13 +55,23 @@ class BoxPlacement:
 
 def rays_of(
     box: Float[np.ndarray, "n 4"],
-    centre: Float[np.ndarray, "n 2"],
     category: Sequence[str],
     intrinsics: Float[np.ndarray, " 4"],
-    height: Float[np.ndarray, " n"],
-    height_scale: Float[np.ndarray, " n"],
+    centre: Float[np.ndarray, "n 2"] | None,
+    height: Float[np.ndarray, " n"] | None,
+    height_scale: Float[np.ndarray, " n"] | None,
 ) -> BoxRays:
-    """Boxes in units of the focal length, with the depth that heights of categories tell (NaN: nobody knows)."""
+    """Boxes in units of the focal length, with the depth that heights of categories tell (NaN: nobody knows).
+
+    Raises:
+        InputError: arrays of different lengths.
+    """
+    n = len(box)
+    for name, values in (("category", category), ("centre", centre), ("height", height), ("height_scale", height_scale)):
+        if values is not None and len(values) != n:
+            raise input_error(f"`{name}` has another length", got=len(values), expected=n)
+    centre = 0.5 * (box[:, :2] + box[:, 2:]) if centre is None else centre
+    height, height_scale = (np.full(n, np.nan) if values is None else values for values in (height, height_scale))
     extent = box[:, 2:] - box[:, :2]
     names = sorted(set(category))
     tall = extent[:, 1] / intrinsics[1]
@@ -119,18 +129,14 @@ def place_boxes(
         InputError: a frame without a row of the odometry, or arrays of different lengths.
     """
     n, config = len(frame), config or BoxConfig()
-    nobody = np.full(n, np.nan)
-    centre = 0.5 * (box[:, :2] + box[:, 2:]) if centre is None else centre
-    for name, values in (("box", box), ("category", category), ("centre", centre)):
-        if len(values) != n:
-            raise input_error(f"`{name}` has another length", got=len(values), expected=n)
-    if n and not (frame.min() >= 0 and frame.max() < len(T_world_camera)):
+    if len(box) != n:
+        raise input_error("`box` has another length", got=len(box), expected=n)
+    outside = frame[(frame < 0) | (frame >= len(T_world_camera))]
+    if len(outside):
         raise input_error(
-            "frame of a box", got=int(frame.max()), expected=f"0 to {len(T_world_camera) - 1}, a row of the odometry"
+            "frame of a box", got=int(outside[0]), expected=f"0 to {len(T_world_camera) - 1}, a row of the odometry"
         )
-    rays = rays_of(
-        box, centre, category, intrinsics, nobody if height is None else height, nobody if height_scale is None else height_scale
-    )
+    rays = rays_of(box, category, intrinsics, centre, height, height_scale)
     view = float(np.prod(np.array(size) / intrinsics[:2]))
     track = track_boxes(frame, rays, T_world_camera, config, view)
     position, covariance = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
@@ -199,18 +205,12 @@ class BoxPlacer:
             centre: where the object's centre is seen, px; the box's by default.
             height: height of the object, m, NaN where nobody knows it.
             height_scale: its standard deviation, m.
+
+        Raises:
+            InputError: arrays of different lengths.
         """
         n = len(box)
-        nobody = np.full(n, np.nan)
-        centre = 0.5 * (box[:, :2] + box[:, 2:]) if centre is None else centre
-        rays = rays_of(
-            box,
-            centre,
-            category,
-            self.intrinsics,
-            nobody if height is None else height,
-            nobody if height_scale is None else height_scale,
-        )
+        rays = rays_of(box, category, self.intrinsics, centre, height, height_scale)
         numbers = np.array([self._numbers.setdefault(name, len(self._numbers)) for name in category], dtype=np.int64)
         rays = replace(rays, category=numbers)  # the same in every frame
         track = self.tracker.step(T_world_camera, self._frame, rays)

@@ -19,6 +19,7 @@ from nolbo_ppl.inference.slam.graph import (
     ObservationFactors,
     add_landmark_equalities,
     linearise,
+    odometry_rows,
 )
 from nolbo_ppl.inference.slam.slam_state import SlamState, measured_graph
 
@@ -69,11 +70,12 @@ def fitted_residuals(state: SlamState, rng: np.random.Generator, count: int = SA
     expected = linearisation.residual_samples(count, rng)
     steps = len(state.problem) - 1
     kept = np.flatnonzero(factors.weight > 1e-3)  # those add_observation_factors takes
-    middle, end = 6 * (steps + 1), 6 * (steps + 1 + len(kept))
+    middle, begin = 6 * (steps + 1), odometry_rows(steps, state.noise)
+    end = begin + 6 * len(kept)
     index = factors.index[kept]
     sure = factors.weight[kept] > 0.5
     rotation = factors.covariance[kept][:, [0, 1, 2], [0, 1, 2]]
-    residual = linearisation.residual[middle:end].reshape(-1, 6)
+    residual = linearisation.residual[begin:end].reshape(-1, 6)
     oriented = rotation < (0.3 * UNINFORMATIVE_ROTATION_SIGMA) ** 2
     residual[:, :3] *= oriented
     root = np.linalg.cholesky(factors.covariance[kept][sure, 3:, 3:] / factors.weight[kept][sure, None, None])
@@ -83,7 +85,7 @@ def fitted_residuals(state: SlamState, rng: np.random.Generator, count: int = SA
         linearisation.residual[6:middle].reshape(-1, 6),
         expected[6:middle].reshape(-1, 6, count),
         residual[sure],
-        expected[middle:end].reshape(-1, 6, count)[sure],
+        expected[begin:end].reshape(-1, 6, count)[sure],
         index[sure],
         oriented[sure],
         root,

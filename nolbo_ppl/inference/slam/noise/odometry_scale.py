@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import logsumexp, softmax
 
 from nolbo_ppl.geometry.pose import chain, relative
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
@@ -124,19 +125,18 @@ def smooth(score: Float[np.ndarray, "w g"], grid: Float[np.ndarray, " g"], walk:
     walk = max(walk, 0.7 * float(grid[1] - grid[0]))  # narrower ones never leave a grid point
     kernel = np.exp(-0.5 * ((grid[:, None] - grid[None]) / walk) ** 2)
     kernel /= kernel.sum(axis=0, keepdims=True)
-    likelihood = np.exp(score - score.max(axis=1, keepdims=True))
-    forward, backward = np.ones_like(score), np.ones_like(score)
-    evidence = float(score.max(axis=1).sum())
-    for w in range(len(score)):
-        before = kernel @ forward[w - 1] if w else np.full(len(grid), 1 / len(grid))
-        forward[w] = before * likelihood[w]
-        evidence += float(np.log(forward[w].sum()))
-        forward[w] /= forward[w].sum()
+    kernel = np.maximum(kernel, 1e-300)  # a jump of the scale is improbable, not a sum of zeros
+
+    def moved(by: np.ndarray, log_value: np.ndarray) -> np.ndarray:
+        largest = log_value.max()
+        return np.asarray(np.log(by @ np.exp(log_value - largest)) + largest)
+
+    forward, backward = score - np.log(len(grid)), np.zeros_like(score)
+    for w in range(1, len(score)):
+        forward[w] = score[w] + moved(kernel, forward[w - 1])
     for w in range(len(score) - 2, -1, -1):
-        backward[w] = kernel.T @ (backward[w + 1] * likelihood[w + 1])
-        backward[w] /= backward[w].sum()
-    posterior = forward * backward
-    return posterior / posterior.sum(axis=1, keepdims=True), evidence
+        backward[w] = moved(kernel.T, backward[w + 1] + score[w + 1])
+    return softmax(forward + backward, axis=1), float(logsumexp(forward[-1]))
 
 
 def scale_profile(problem: SlamProblem, walk: float | None = None) -> ScaleProfile:

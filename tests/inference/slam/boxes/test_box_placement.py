@@ -11,7 +11,7 @@ from nolbo_ppl.data.simulated_boxes import BoxDetectorConfig, SimulatedBoxes, si
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse, make_pose, so3_exp, transform
 from nolbo_ppl.inference.slam import SlamProblem, solve, solve_incremental
-from nolbo_ppl.inference.slam.boxes.box_placement import place_boxes
+from nolbo_ppl.inference.slam.boxes.box_placement import BoxPlacer, place_boxes
 from nolbo_ppl.inference.slam.boxes.box_triangulation import triangulate
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 
@@ -136,3 +136,7 @@ def test_what_does_not_fit_is_refused() -> None:
         place_boxes(np.array([5]), box, ["a"], np.tile(np.eye(4), (3, 1, 1)), INTRINSICS, CAMERA.size)
     with pytest.raises(InputError, match="`category` has another length: got 2, expected 1"):
         place_boxes(np.array([0]), box, ["a", "b"], np.tile(np.eye(4), (3, 1, 1)), INTRINSICS, CAMERA.size)
+    with pytest.raises(InputError, match="frame of a box: got -1"):
+        place_boxes(np.array([-1]), box, ["a"], np.tile(np.eye(4), (3, 1, 1)), INTRINSICS, CAMERA.size)
+    with pytest.raises(InputError, match="`height` has another length: got 2, expected 1"):
+        BoxPlacer(INTRINSICS, CAMERA.size).place(np.eye(4), box, ["a"], height=np.ones(2), height_scale=np.ones(2))
