@@ -44,8 +44,8 @@ def forget_oldest(graph: IncrementalGraph, loops: LoopCloser, keeper: KeyframeKe
     leaving: list[int] = []
     gone: set[int] = set()
     poses = sorted(graph.of_pose)
-    newest = [p for p in poses if p <= frame - keeper.config.window - keeper.config.stretch]
-    for pose in newest:
+    old = [p for p in poses if p <= frame - keeper.config.window - keeper.config.stretch]
+    for pose in old:
         if len(graph.factors) - len(gone) <= left:
             break
         leaving.append(pose)

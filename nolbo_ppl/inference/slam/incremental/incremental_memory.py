@@ -28,6 +28,7 @@ class IncrementalMemory:
         self.config, self.keyframes = config, keyframes
         self.tracker: Tracker | None = None
         self.frames = 0
+        self.last_oriented: int | None = None
         self.last_odometry = np.eye(4)
         self.odometry: list[np.ndarray] = []
         self.tables: list[Detections] = []

@@ -139,6 +139,8 @@ class IncrementalSlam(IncrementalMemory):
             self.tables.append(replace(table, frame=np.full(len(table), frame, dtype=np.int64)))
             self.assigned.append(assigned)
             self.weights.append(weight)
+        if table.has_rotation.any():
+            self.last_oriented = frame
         met = self._map(table, measurements, noise, assigned, frame)
         self.keeper.advance(frame, self.graph)
         self.graph.commit()
@@ -292,7 +294,7 @@ class IncrementalSlam(IncrementalMemory):
         tracks = [self.tracks[number] for number, _ in asking]
         poses = [self._pose_of(table, i) for _, i in asking]
         found, new = self.loops.meet([t.draft for t in tracks], poses, frame, self._live(), self.graph, noise)
-        met = 0
+        met, oriented = 0, self.last_oriented is not None and frame - self.last_oriented < LATELY
         for track, T, (landmark, weight), alone, (_, i) in zip(tracks, poses, found, new, asking):
             if weight > SURE_WEIGHT:
                 old = self.loops.map.landmarks[landmark]
@@ -301,7 +303,6 @@ class IncrementalSlam(IncrementalMemory):
                 self.loops.met(landmark, T[:3, 3], noise)
                 met += 1
             elif alone > SURE_WEIGHT or len(track.waiting) >= MOST_WAIT:
-                oriented = any(one.has_rotation.any() for one in self.tables[-LATELY:])
                 number = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])), oriented)
                 track.landmark = track.draft.number = number
                 track.draft.place = self.loops.drift.place

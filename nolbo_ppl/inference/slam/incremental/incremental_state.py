@@ -64,6 +64,7 @@ def save_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
         "config": asdict(slam.config) | {"category_symmetry": dict(slam.config.category_symmetry)},
         "keyframes": asdict(slam.keyframes),
         "frames": slam.frames,
+        "last_oriented": slam.last_oriented,
         "stated": slam.stated,
         "drives": slam.drives,
         "factors": [slam.scales.position_factor, slam.scales.range_factor, slam.scales.rotation_factor],
@@ -105,6 +106,7 @@ def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
             slam.config = SlamConfig(**config)
             slam.keyframes = KeyframeConfig(**meta["keyframes"])
             slam.frames, slam.stated, slam.drives = int(meta["frames"]), meta["stated"], int(meta["drives"])
+            slam.last_oriented = meta.get("last_oriented", slam.frames - 1)  # files of 0.1.0: landmarks free to turn, as there
             slam.prior = FeaturePrior(
                 archive.array("prior/mean", (None,)),
                 archive.array("prior/variance", (None,)),

@@ -104,6 +104,13 @@ def test_without_history_memory_holds_no_detections() -> None:
     slam = start(drive, KeyframeConfig(history=False))
     infos = feed(slam, drive, 0, 30)
     assert not slam.tables and not slam.odometry and infos[-1].landmarks == len(slam.landmarks())
+    whole = start(drive)
+    feed(whole, drive, 0, 30)
+    np.testing.assert_array_equal(slam.trajectory(), whole.trajectory())  # what is kept changes nothing
+    pairs = list(zip(slam.landmarks(), whole.landmarks(), strict=True))
+    assert pairs
+    for one, other in pairs:
+        np.testing.assert_array_equal(one.covariance, other.covariance)
     with pytest.raises(InputError, match="history"):
         slam.finish()
 
