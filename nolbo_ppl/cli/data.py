@@ -11,10 +11,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from nolbo_ppl.data import picture_formats  # noqa: F401 (registers its formats)
+from nolbo_ppl.data import known_formats, picture_formats  # noqa: F401 (register their formats)
 from nolbo_ppl.data.converters import archive_formats  # noqa: F401 (registers its formats)
 from nolbo_ppl.data.format_registry import FORMATS, FormatReport, check_data
-from nolbo_ppl.data.known_formats import spread  # noqa: F401 (registers its formats)
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.viz.contact_sheet import write_contact_sheet
 
@@ -49,19 +48,20 @@ def run(config: DataCheckConfig) -> FormatReport:
     return report
 
 
-def _shown(value: Any) -> str:
+def _shown(value: Any, name: str = "") -> str:
     if isinstance(value, dict):
-        items = [f"{name} {_shown(part)}" for name, part in value.items()]
+        items = [f"{key} {_shown(part, key)}" for key, part in value.items()]
         return ", ".join(items[:LONGEST]) + (f", and {len(items) - LONGEST} more" if len(items) > LONGEST else "")
     if isinstance(value, list):
-        return " to ".join(map(str, value)) if len(value) == 2 else " ".join(map(str, value[:LONGEST]))
+        pair = len(value) == 2 and all(isinstance(part, int | float) for part in value)
+        return (" x " if name == "size" else " to " if pair else " ").join(map(str, value[:LONGEST]))
     return str(value)
 
 
 def describe(report: FormatReport, indent: str = "") -> str:
     """A few lines for the terminal."""
     lines = [f"{indent}{report.what}" + (f" [{report.format}]" if report.format in FORMATS else "")]
-    lines += [f"{indent}  {name.replace('_', ' ')}: {_shown(value)}" for name, value in report.facts.items()]
+    lines += [f"{indent}  {name.replace('_', ' ')}: {_shown(value, name)}" for name, value in report.facts.items()]
     for name, part in report.parts:
         lines += [f"{indent}  {name}:", describe(part, indent + "    ")]
     if not report.parts:

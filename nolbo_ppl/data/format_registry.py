@@ -18,6 +18,7 @@ from jaxtyping import Float, UInt8
 
 from nolbo_ppl.errors import InputError, input_error
 from nolbo_ppl.io.images import is_passed_over
+from nolbo_ppl.io.ros_bags import split_topic
 
 HEAD = 4096
 """Bytes of a file that tests look at."""
@@ -27,6 +28,13 @@ UNKNOWN = "unknown"
 """Format of what no format fits."""
 MOST_PARTS = 60
 """Parts of a folder that are looked into."""
+SHOWN = 12
+"""Pictures of a contact sheet."""
+
+
+def spread(count: int, most: int = SHOWN) -> list[int]:
+    """Places of at most so many of `count`, evenly, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist() if count else []
 
 
 @dataclass(frozen=True)
@@ -190,9 +198,9 @@ def check_data(path: str | PathLike[str], name: str | None = None, depth: int = 
     path = Path(path)
     if name is not None and name not in FORMATS:
         raise input_error("no such format", got=name, expected="one of " + ", ".join(sorted(FORMATS)))
-    found = [(SURE, FORMATS[name])] if name is not None else recognise(path)
-    if not path.exists() and not found:
+    if not split_topic(path)[0].exists():
         raise input_error("no such file or folder", file=path)
+    found = [(SURE, FORMATS[name])] if name is not None else recognise(path)
     failure: FormatReport | None = None
     for _, one in found:
         try:

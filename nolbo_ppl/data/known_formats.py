@@ -12,7 +12,7 @@ import numpy as np
 
 from nolbo_ppl.data.converters.foreign_detections import DetectionFormat, ForeignDetections, read_foreign_detections
 from nolbo_ppl.data.dataset_folder import SceneFolder
-from nolbo_ppl.data.format_registry import LIKELY, POSSIBLE, SURE, FormatReport, LabelledPicture, Look, register
+from nolbo_ppl.data.format_registry import LIKELY, POSSIBLE, SURE, FormatReport, LabelledPicture, Look, register, spread
 from nolbo_ppl.data.sequences import ImageFolder, frames_with_camera, open_frames
 from nolbo_ppl.data.sequences.opening import IMAGE_FOLDERS
 from nolbo_ppl.data.sequences.video import VIDEO_SUFFIXES
@@ -27,18 +27,11 @@ from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
 from nolbo_ppl.io.trajectory_documents import is_colmap
 from nolbo_ppl.synthetic.assets.cad import load_mesh
 
-SHOWN = 12
-"""Pictures of a contact sheet."""
 LOOKED_AT = 300
 """Images whose headers are read; of more, so many evenly."""
 JUMP = 20.0
 """A step longer than so many medians is named."""
 MESHES = (".obj", ".off", ".glb", ".gltf", ".ply", ".stl")
-
-
-def spread(count: int, most: int) -> list[int]:
-    """Places of at most so many, evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist() if count else []
 
 
 def time_facts(times: np.ndarray | None) -> dict[str, Any]:
@@ -95,7 +88,7 @@ def report_images(path: Path) -> FormatReport:
 
 
 def _pictures(frames: Any) -> Iterator[LabelledPicture]:
-    for k in spread(len(frames), SHOWN):
+    for k in spread(len(frames)):
         try:
             yield LabelledPicture(frames.name(k), frames.image(k))
         except InputError:
@@ -302,6 +295,8 @@ def _lines_with(*words: str) -> Any:
 def report_observations(path: Path) -> FormatReport:
     """Detections, frames, categories, what is stated."""
     found = read_observations(path)
+    if not len(found):
+        return FormatReport("observations", "observations for nolbo slam", {"detections": 0}, ("no detections",))
     facts: dict[str, Any] = {"detections": len(found), "frames": [int(found.frame.min()), int(found.frame.max())]}
     facts["categories"] = dict(Counter(str(name) for name in found.category).most_common())
     stated = {"position_covariance": np.isfinite(found.position_covariance[:, 0, 0]), "rotation": found.has_rotation}
@@ -341,7 +336,7 @@ def report_scenes(path: Path) -> FormatReport:
     facts["sizes"] = {f"{w} x {h}": count for (w, h), count in sizes.most_common()}
 
     def pictures() -> Iterator[LabelledPicture]:
-        for k in spread(len(folder), SHOWN):
+        for k in spread(len(folder)):
             record = folder.records[k]
             if record.file is not None:
                 labels = tuple(str(name) for name in record.category)

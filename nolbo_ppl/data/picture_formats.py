@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nolbo_ppl.data.format_registry import LIKELY, SURE, FormatReport, LabelledPicture, Look, register
+from nolbo_ppl.data.format_registry import LIKELY, SURE, FormatReport, LabelledPicture, Look, register, spread
 from nolbo_ppl.data.imagenet import open_imagenet
 from nolbo_ppl.data.modelnet import modelnet_files
 from nolbo_ppl.data.render_for_cnn import HELD_OUT, NAME, open_render_for_cnn
@@ -17,12 +17,12 @@ from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.images import open_image
 from nolbo_ppl.synthetic.assets.off_file import read_off
 
-SHOWN = 12
-"""Pictures of a contact sheet, and problems that are named."""
+MOST_PROBLEMS = 12
+"""Problems that are named."""
 
 
 def _pictures(files: Sequence[Path], labels: Sequence[str]) -> Iterator[LabelledPicture]:
-    for k in np.unique(np.linspace(0, len(files) - 1, min(len(files), SHOWN)).round().astype(int)) if files else []:
+    for k in spread(len(files)):
         image = open_image(files[k])
         box = np.array([[0.0, 0.0, image.shape[1], image.shape[0]]])
         yield LabelledPicture(files[k].name, image, box, (labels[k],))
@@ -114,5 +114,5 @@ def report_modelnet(path: Path) -> FormatReport:
                 read_off(file)
             except InputError as error:
                 problems.append(str(error))
-    more = [f"{len(problems) - SHOWN} more models cannot be read"] if len(problems) > SHOWN else []
-    return FormatReport("modelnet", "ModelNet: CAD models by class and split", facts, (*problems[:SHOWN], *more))
+    more = [f"{len(problems) - MOST_PROBLEMS} more models cannot be read"] if len(problems) > MOST_PROBLEMS else []
+    return FormatReport("modelnet", "ModelNet: CAD models by class and split", facts, (*problems[:MOST_PROBLEMS], *more))

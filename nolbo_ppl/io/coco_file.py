@@ -64,7 +64,7 @@ def read_coco_images(path: str | PathLike[str], images: str | PathLike[str]) -> 
         (10.0, 20.0, 50.0, 50.0)
     """
     file, folder = Path(path), Path(images)
-    content = _lists(read_json(file), file)
+    content = coco_lists(file)
     names = {row["id"]: str(row.get("name")) for row in content["categories"]}
     of_image: dict[Any, list[CocoAnnotation]] = defaultdict(list)
     for row in content["annotations"]:
@@ -83,8 +83,9 @@ def read_coco_images(path: str | PathLike[str], images: str | PathLike[str]) -> 
     ]
 
 
-def _lists(content: Any, file: Path) -> dict[str, list[dict[str, Any]]]:
-    wanted = ("images", "annotations", "categories")
+def coco_lists(file: Path) -> dict[str, list[dict[str, Any]]]:
+    """`images`, `annotations` and `categories` of a file, each a list of objects with an id. Raises `InputError` naming it."""
+    content, wanted = read_json(file), ("images", "annotations", "categories")
     if not isinstance(content, dict) or not all(isinstance(content.get(name), list) for name in wanted):
         raise input_error("not a COCO file", expected='{"images": [...], "annotations": [...], "categories": [...]}', file=file)
     for name in wanted:

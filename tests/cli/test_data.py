@@ -154,6 +154,7 @@ def test_bags_are_told(tmp_path: Path) -> None:
         (lambda f: (pictures(f / "i"), Image.new("L", (9, 9)).save(f / "i" / "z.png"))[0] or f / "i", "images of 2 sizes"),
         (lambda f: text(f / "k.json", '{"fx": 9, "fy": 9, "cx": 4, "cy": 3, "k9": 1}'), "unknown fields of a camera"),
         (lambda f: coco(f / "i.json"), "annotation 2 is of an image that is not listed"),
+        (lambda f: text(f / "i.json", json.dumps({**json.loads(coco(f / "i.json").read_text()), "images": [{}]})), "with an id"),
         (lambda f: text(f / "r.json", RESULTS.replace("0.5", "7")), "score: got 7.0"),
         (lambda f: text(f / "notes.md", "# notes"), "no format fits"),
         (lambda f: f, "the folder is empty"),
@@ -184,8 +185,11 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     with pytest.raises(SystemExit) as end:
         main(["data", "check", str(text(tmp_path / "a.txt", KITTI + "1 0 0 900 0 1 0 0 0 0 1 0\n"))])
     assert end.value.code == 1 and "wrong: a jump" in capsys.readouterr().out
+    main(["data", "check", str(folder / "images" / "frame0.png")])
+    assert "size: 40 x 30" in capsys.readouterr().out
     for arguments, match in (
         (["check", str(tmp_path / "nothing")], "no such file or folder"),
+        (["check", "voc-annotations", str(tmp_path / "nothing")], "no such file or folder"),
         (["check", "nonsense", str(folder)], "no such format: got nonsense"),
         (["look", str(folder)], "expected check"),
         (["check", str(tmp_path / "a.txt"), "--out", str(sheet)], "no pictures for a contact sheet"),

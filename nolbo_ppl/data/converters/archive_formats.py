@@ -17,14 +17,12 @@ from nolbo_ppl.data.converters.archives import ArchiveImage
 from nolbo_ppl.data.converters.pascal3d import read_objectnet3d, read_pascal3d, read_record
 from nolbo_ppl.data.converters.pix3d import read_pix3d
 from nolbo_ppl.data.converters.voc import read_voc, read_voc_annotation
-from nolbo_ppl.data.format_registry import LIKELY, SURE, FormatReport, LabelledPicture, Look, register
-from nolbo_ppl.errors import InputError, input_error
+from nolbo_ppl.data.format_registry import LIKELY, SURE, FormatReport, LabelledPicture, Look, register, spread
+from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.masks import mask_moments
-from nolbo_ppl.io.files import read_json
+from nolbo_ppl.io.coco_file import coco_lists
+from nolbo_ppl.io.fields import number_array
 from nolbo_ppl.io.images import open_image
-
-SHOWN = 12
-"""Pictures of a contact sheet."""
 
 
 def labelled(name: str, what: str, looks_like: Callable[[Look], float], read: Callable[[Path], Iterable[ArchiveImage]]) -> None:
@@ -55,7 +53,7 @@ def images_report(name: str, what: str, images: list[ArchiveImage]) -> FormatRep
 
     def pictures() -> Iterator[LabelledPicture]:
         shown = [image for image in images if image.path.is_file()]
-        for k in np.unique(np.linspace(0, len(shown) - 1, min(len(shown), SHOWN)).round().astype(int)) if shown else []:
+        for k in spread(len(shown)):
             one = shown[k]
             boxes = np.array([thing.box for thing in one.objects], dtype=np.float64).reshape(-1, 4)
             yield LabelledPicture(one.path.name, open_image(one.path), boxes, tuple(thing.category for thing in one.objects))
@@ -117,27 +115,25 @@ def _coco(look: Look) -> float:
 @register("coco", "MS-COCO instances", _coco)
 def report_coco(path: Path) -> FormatReport:
     """Images, objects by category, masks; the categories of the library among them."""
-    content = read_json(path)
-    if not isinstance(content, dict) or not isinstance(content.get("annotations"), list) or "images" not in content:
-        raise input_error("not a COCO file of instances", expected='{"images": [], "annotations": [], ...}', file=path)
-    names = {row["id"]: str(row["name"]) for row in content.get("categories", [])}
+    content = coco_lists(path)
+    names, known = {row["id"]: str(row.get("name")) for row in content["categories"]}, {row["id"] for row in content["images"]}
     rows = content["annotations"]
     facts: dict[str, Any] = {"images": len(content["images"]), "objects": len(rows)}
-    facts["categories"] = dict(Counter(names.get(row.get("category_id"), "?") for row in rows).most_common())
+    labels = [names.get(label, "?") if isinstance(label := row.get("category_id"), int | str) else "?" for row in rows]
+    facts["categories"] = dict(Counter(labels).most_common())
     facts["crowds"] = sum(bool(row.get("iscrowd")) for row in rows)
     facts["of_the_library"] = sorted(set(facts["categories"]) & set(CATEGORIES))
     problems, masks = [], 0
-    known = {image["id"]: image for image in content["images"]}
     for row in rows:
-        if row.get("image_id") not in known:
-            problems.append(f"annotation {row.get('id')} is of an image that is not listed")
-        box = row.get("bbox")
-        if not (isinstance(box, list) and len(box) == 4 and box[2] > 0 and box[3] > 0):
-            problems.append(f"annotation {row.get('id')}: box {box}")
+        image, box = row.get("image_id"), number_array(row.get("bbox"), (4,))
+        if not isinstance(image, int | str) or image not in known:
+            problems.append(f"annotation {row['id']} is of an image that is not listed")
+        if box is None or (box[2:] <= 0).any():
+            problems.append(f"annotation {row['id']}: box {row.get('bbox')}")
         try:
             masks += mask_moments(row["segmentation"]) is not None if row.get("segmentation") else 0
         except InputError as error:
-            problems.append(f"annotation {row.get('id')}: {error}")
+            problems.append(f"annotation {row['id']}: {error}")
     facts["masks"] = masks
     return FormatReport("coco", "MS-COCO instances", facts, tuple(problems[:20]))
 
