@@ -273,7 +273,7 @@ def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
     source: Any = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
     names = SCENES if hasattr(source, "write") and not isinstance(source, ForeignFile) else DRIVE
-    inputs = [getattr(source, name, None) for name in ("data", "images", "intrinsics", "names", "heights")]
+    inputs = [getattr(source, name, None) for name in ("data", "images", "intrinsics", "names", "heights", "odometry")]
     with output_folder(source.out, names, is_own=is_converted, inputs=inputs) as folder:
         if hasattr(source, "write"):
             written = dataclasses.replace(source, out=folder).write()

@@ -29,9 +29,9 @@ from nolbo_ppl.data.simulated_paths import circle, figure_of_eight, room, straig
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.io.files import read_json_object
-from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
+from nolbo_ppl.structures.detections import Detections
 
 RESULT = ("odometry.txt", "truth.txt", "observations.jsonl", "objects.json", "source.json")
 """Files of a simulated drive."""

@@ -85,6 +85,7 @@ def run(arguments: SlamRunConfig) -> tuple[SlamResult, dict[str, object]]:
         arguments.truth,
         arguments.truth_objects,
         arguments.intrinsics,
+        arguments.heights,
     )
     with output_folder(arguments.out, RESULT, is_own=is_result, inputs=inputs) as folder:
         return _solve(arguments, folder)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.geometry.pose import R_WORLD_UPRIGHT, chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
-from nolbo_ppl.io.observations import Detections
+from nolbo_ppl.structures.detections import Detections
 
 
 @dataclass(frozen=True)

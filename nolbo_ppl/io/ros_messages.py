@@ -180,6 +180,9 @@ class FixedFrames:
 
     Args:
         bag: where they are recorded.
+
+    Raises:
+        InputError: a transform that is not finite, or without a rotation; names the bag and its frames.
     """
 
     def __init__(self, bag: Bag) -> None:
@@ -189,6 +192,11 @@ class FixedFrames:
                 for one in message.transforms:
                     T = pose_of(one)
                     a, b = one.header.frame_id.strip("/"), one.child_frame_id.strip("/")
+                    if np.isnan(T).any():
+                        got = f"{a} to {b}"
+                        raise input_error(
+                            "a transform of /tf_static is no pose", got=got, expected="a unit quaternion", file=bag.path
+                        )
                     self.edges.setdefault(a, {})[b] = T
                     self.edges.setdefault(b, {})[a] = inverse(T[None])[0]
 

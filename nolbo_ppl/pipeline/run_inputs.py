@@ -38,6 +38,7 @@ from nolbo_ppl.odometry import (
 )
 from nolbo_ppl.pipeline.perception import DepthSource, depth_noise, open_depth
 from nolbo_ppl.pipeline.run_config import RunConfig
+from nolbo_ppl.pipeline.stage_keys import folder_digest
 
 Poses = Float[np.ndarray, "n 4 4"]
 
@@ -78,7 +79,7 @@ class RunInputs:
         if isinstance(source, ImageFolder):
             return [[file.name, file.stat().st_size] for file in source.files]
         if isinstance(source, BagFrames):
-            return [len(source), source.topic, source.path.name, source.path.stat().st_size]
+            return [len(source), source.topic, folder_digest(source.path)[1]]
         return [len(source), source.path.stat().st_size]
 
 

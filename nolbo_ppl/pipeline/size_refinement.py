@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.data.converters.coco_names import HEIGHTS
-from nolbo_ppl.data.converters.foreign_detections import RIM
+from nolbo_ppl.data.converters.foreign_detections import is_whole
 from nolbo_ppl.pipeline.depth_refinement import fuse_along_ray, half_extent_along_ray
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
@@ -58,7 +58,7 @@ def usual_range(
     names = [observed.categories[k] for k in np.asarray(observed.class_log_posterior).argmax(axis=1)]
     height, spread = np.array([heights.get(name, (np.nan, np.nan)) for name in names]).reshape(-1, 2).T
     tall = box[:, 3] - box[:, 1]
-    whole = (box[:, :2] > RIM).all(axis=1) & (box[:, 2:] < np.array(image_size) - RIM).all(axis=1) & (tall > 1.0)
+    whole = is_whole(box, image_size) & (tall > 1.0)
     ray = np.asarray(observed.position, dtype=np.float64)
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     size = np.asarray(observed.size, dtype=np.float64)

@@ -72,7 +72,7 @@ def json_of(config: Any) -> dict[str, Any]:
 
 
 def file_digest(path: Path | None) -> Any:
-    """Digest of a file's content, None without a file; of a bag, which may be larger than memory, name and size.
+    """Digest of a file's content, None without a file; of a bag, which may be larger than memory, names and sizes.
 
     Raises:
         InputError: there is no such file.
@@ -80,18 +80,18 @@ def file_digest(path: Path | None) -> Any:
     if path is None:
         return None
     if is_bag(path):
-        file = split_topic(path)[0]
-        return [str(path), file.stat().st_size if file.exists() else None]
+        return folder_digest(path)
     if not path.is_file():
         raise input_error("no such file", file=path)
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def folder_digest(path: Path | None) -> Any:
-    """Names and sizes of a folder's files, or of one file; None without one."""
+    """Names and sizes of a folder's files, or of one file, or of those of a bag whose topic is named; None without one."""
     if path is None:
         return None
-    files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
+    place = split_topic(path)[0]
+    files = [place] if place.is_file() else sorted(place.iterdir()) if place.is_dir() else []
     return [str(path), [[file.name, file.stat().st_size] for file in files if file.is_file()]]
 
 

@@ -128,6 +128,14 @@ def test_what_is_wrong_is_named(tmp_path: Path, kind: str) -> None:
         read_trajectory(path)
     with pytest.raises(InputError, match="no topic of camera info"):
         read_camera(path)
+    (tmp_path / "turned").mkdir()
+    bad = path_of(tmp_path / "turned", kind)
+    with BagWriter(bad, kind) as bag:
+        bag.static("base", "camera", np.diag([np.nan, 1, 1, 1]))
+        bag.image("/cam/image", 1.0, colours(0), "rgb8")
+        bag.odometry("/odom", 1.0, np.eye(4), "base")
+    with pytest.raises(InputError, match="a transform of /tf_static is no pose: got base to camera"):
+        read_trajectory(bad)
     files = [path] if kind == "bag" else [file for file in path.iterdir() if file.suffix != ".yaml"]
     for file in files:
         whole = file.read_bytes()

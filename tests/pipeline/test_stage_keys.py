@@ -83,6 +83,18 @@ def test_what_lies_where_an_option_leads_counts(option: str, file: str, stage: s
     assert next(key for key in STAGES if before[key] != after[key]) == stage
 
 
+@pytest.mark.parametrize("option", ["odometry", "depth"])
+def test_what_a_bag_that_is_a_folder_holds_counts(option: str, config: RunConfig, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text("")
+    config = dataclasses.replace(config, **{option: Path(f"{bag}:/topic")})
+    (bag / "0.mcap").write_bytes(b"recorded")
+    before = prints(config)
+    (bag / "0.mcap").write_bytes(b"recorded anew")
+    assert prints(config)["odometry"] != before["odometry"]
+
+
 def test_an_option_without_a_stage_is_refused() -> None:
     @dataclasses.dataclass(frozen=True)
     class Forgetful:

@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.files import write_json
 from nolbo_ppl.io.npz import save_npz
-from nolbo_ppl.io.observations import Detections, write_observations
+from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, write_trajectory
+from nolbo_ppl.structures.detections import Detections
 
 
 @dataclass(frozen=True)

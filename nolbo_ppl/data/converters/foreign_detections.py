@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.data.converters.coco_names import COCO_IDS, COCO_NAMES, HEIGHTS
 from nolbo_ppl.data.converters.kitti_tracking import car_rotation
@@ -68,6 +68,31 @@ class ForeignDetections:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def placed(
+        self, rows: Int[np.ndarray, " k"], position: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"]
+    ) -> Detections:
+        """Some of the detections as observations for SLAM, with positions in their camera frames, m, that all of them have got.
+
+        Their identifiers are `d` and their number here.
+        """
+        return Detections.from_arrays(
+            self.frame[rows],
+            position[rows],
+            position_covariance=covariance[rows],
+            rotation=self.rotation[rows],
+            objectness=np.clip(self.score[rows], 1e-3, 1 - 1e-3),
+            category=[self.category[k] for k in rows],
+            size=self.size[rows],
+            box=self.box[rows],
+            id=[f"d{k}" for k in rows],
+        )
+
+
+def is_whole(box: Float[np.ndarray, "n 4"], size: Sequence[float] | Float[np.ndarray, " 2"]) -> Bool[np.ndarray, " n"]:
+    """Boxes that keep away from the rim of an image of this width and height, px; false for NaN."""
+    inside: np.ndarray = (box[:, :2] > RIM).all(axis=1) & (box[:, 2:] < np.asarray(size) - RIM).all(axis=1)
+    return inside
 
 
 @dataclass
@@ -361,9 +386,7 @@ def observations_of(
     extent = found.box[:, 2:] - found.box[:, :2]
     placed = np.isfinite(found.position).all(axis=1)
     known = np.array([c in heights for c in found.category], dtype=bool)
-    whole = np.ones(count, dtype=bool)
-    if size is not None:
-        whole &= (found.box[:, :2] > RIM).all(axis=1) & (found.box[:, 2:] < np.array(size) - RIM).all(axis=1)
+    whole = np.ones(count, dtype=bool) if size is None else is_whole(found.box, size)
     scored = found.score >= minimum_score
     keep = scored & (placed | (known & whole))
     H, spread = np.array([heights.get(c, (np.nan, np.nan)) for c in found.category]).reshape(-1, 2).T
@@ -375,20 +398,9 @@ def observations_of(
     for k in np.flatnonzero(keep & ~placed):
         along = ray[k] * depth[k] * np.hypot(spread[k] / H[k], CENTRE_SHARE)
         covariance[k] = np.outer(along, along) + np.diag([across[k, 0] ** 2, across[k, 1] ** 2, (0.1 * spread[k]) ** 2])
-    rows = np.flatnonzero(keep)
-    table = Detections.from_arrays(
-        found.frame[rows],
-        position[rows],
-        position_covariance=covariance[rows],
-        rotation=found.rotation[rows],
-        objectness=np.clip(found.score[rows], 1e-3, 1 - 1e-3),
-        category=[found.category[k] for k in rows],
-        size=found.size[rows],
-        box=found.box[rows],
-    )
     left_out = {
         "below the score": int((~scored).sum()),
         "without a height of their category": int((scored & ~placed & ~known).sum()),
         "cut off by the image": int((scored & ~placed & known & ~whole).sum()),
     }
-    return table, left_out
+    return found.placed(np.flatnonzero(keep), position, covariance), left_out

@@ -12,8 +12,8 @@ from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.data.simulate import DetectorConfig, SimulatedWorld, simulate_detections
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.npz import read_npy
-from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
+from nolbo_ppl.structures.detections import Detections
 
 
 def pole_positions(poles: Float[np.ndarray, "m 2"], truth: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "m 3"]:

@@ -14,8 +14,8 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 from nolbo_ppl.io.files import read_text
 from nolbo_ppl.io.npz import read_npz
-from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory
+from nolbo_ppl.structures.detections import Detections
 
 
 def planar_poses(states: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4 4"]:

@@ -1,7 +1,8 @@
 """Labelled photographs (COCO's JSON) as scenes to learn from and to evaluate on.
 
 Beside COCO's own fields an image may have `exhaustive`, the categories of which every instance is labelled (all of them when
-it is missing), and an annotation `difficult` and a viewpoint `azimuth`, `elevation`, `theta` in degrees (PASCAL3D+).
+it is missing), and an annotation `difficult` and a viewpoint `azimuth`, `elevation`, `theta` in degrees: the first two as
+PASCAL3D+ has them, `theta` turns the picture clockwise, against PASCAL3D+.
 """
 
 from __future__ import annotations

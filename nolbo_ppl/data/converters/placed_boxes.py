@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from nolbo_ppl.data.converters.foreign_detections import RIM, ForeignDetections
+from nolbo_ppl.data.converters.foreign_detections import RIM, ForeignDetections, is_whole
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.distortion import undistort_boxes
 from nolbo_ppl.inference.slam.boxes.box_placement import BoxPlacer, place_boxes
@@ -76,8 +76,7 @@ def observations_by_parallax(
     reason = np.full(n, "", dtype=object)
     placed = np.isfinite(found.position).all(axis=1)
     limit = np.array(size, dtype=np.float64) if size is not None else np.nanmax(found.box[:, 2:], axis=0, initial=1.0) + 2 * RIM
-    whole = (found.box[:, :2] > RIM).all(axis=1) & (found.box[:, 2:] < limit - RIM).all(axis=1)
-    reason[~placed & ~whole] = "cut off by the image"
+    reason[~placed & ~is_whole(found.box, limit)] = "cut off by the image"
     reason[found.score < minimum_score] = "below the score"
     rows = np.flatnonzero((reason == "") & ~placed)
     tall = np.array([heights.get(name, (np.nan, np.nan)) for name in found.category], dtype=np.float64).reshape(-1, 2)
@@ -112,16 +111,5 @@ def observations_by_parallax(
             config=config,
         )
         position[rows], covariance[rows], reason[rows] = answer.position, answer.covariance, list(answer.reason)
-    keep = np.flatnonzero(reason == "")
-    table = Detections.from_arrays(
-        found.frame[keep],
-        position[keep],
-        position_covariance=covariance[keep],
-        rotation=found.rotation[keep],
-        objectness=np.clip(found.score[keep], 1e-3, 1 - 1e-3),
-        category=[found.category[k] for k in keep],
-        size=found.size[keep],
-        box=found.box[keep],
-        id=[f"d{k}" for k in keep],
-    )
+    table = found.placed(np.flatnonzero(reason == ""), position, covariance)
     return table, dict(sorted(Counter(name for name in reason.tolist() if name).items()))

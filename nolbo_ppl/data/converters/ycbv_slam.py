@@ -11,8 +11,8 @@ from nolbo_ppl.data.converters.converted import Converted, existing
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import chain, make_pose, nearest_rotation, quaternion_to_matrix, relative, se3_exp, so3_log
 from nolbo_ppl.io.npz import Npz
-from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.io.trajectories import Trajectory
+from nolbo_ppl.structures.detections import Detections
 
 
 def poses_of(rows: np.ndarray) -> np.ndarray:

@@ -230,3 +230,14 @@ def test_damaged_lines_are_named(tmp_path: Path, line: str, match: str) -> None:
     (tmp_path / "a.json").write_text(line + "\n")
     with pytest.raises(InputError, match=match):
         read_foreign_detections(tmp_path / "a.json", "lines")
+
+
+def test_an_odometry_that_lies_in_the_output_stays(tmp_path: Path) -> None:
+    (tmp_path / "boxes.jsonl").write_text('{"frame": 0, "box": [100, 100, 120, 140]}\n')
+    (tmp_path / "camera.txt").write_text("300 300 160 120\n")
+    (tmp_path / "odometry.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    files = {"data": "boxes.jsonl", "intrinsics": "camera.txt", "odometry": "odometry.txt", "out": "."}
+    options = [word for name, file in files.items() for word in (f"--{name}", str(tmp_path / file))]
+    with pytest.raises(InputError, match="would replace an input"):
+        main(["detections", "--format", "lines", *options])
+    assert (tmp_path / "odometry.txt").is_file()

@@ -42,8 +42,8 @@ from nolbo_ppl.inference.slam.slam_problem import (
 from nolbo_ppl.inference.slam.slam_result import SlamResult
 from nolbo_ppl.inference.slam.solve import complete
 from nolbo_ppl.inference.slam.tracking import summarise_tracks
-from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.landmark import Landmark
 
 MOST_WAIT = 5
