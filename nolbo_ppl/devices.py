@@ -37,8 +37,8 @@ def device_of(name: str | torch.device = "auto") -> torch.device:
     apple = torch.backends.mps.is_available()
     if name == "auto":
         name = "cuda" if cuda else "mps" if apple else "cpu"
-    kind, _, number = name.partition(":")
-    if kind not in ("cpu", "cuda", "mps") or (number and not (kind == "cuda" and number.isdecimal())):
+    kind, colon, number = name.partition(":")
+    if kind not in ("cpu", "cuda", "mps") or (colon and not (kind == "cuda" and number.isdecimal())):
         raise input_error("device", got=repr(name), expected=NAMES)
     if kind == "mps" and not apple:
         raise input_error("device", got=name, expected="a device of this machine", do="use --device cpu")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from nolbo_ppl.inference.elbo import INCLUSIVE, SceneELBO
-from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observation_model import Nolbo, evaluation_mode
 from nolbo_ppl.models.scene_batch import SceneBatch
 
 
@@ -47,29 +47,26 @@ def image_terms(
         weights: of the terms.
         decode: see `nolbo_ppl.inference.elbo.SceneELBO.evaluate`.
     """
-    training = [module for module in model.modules() if module.training]
-    model.eval()
     elbo, found = SceneELBO(weights), []
-    for k in range(len(batch.image)):
-        scene = model.guide.observe(batch[k : k + 1])
-        result = elbo.evaluate(model.story, model.guide, scene, scenes=1, decode=decode)
-        counted, one = scene.assignment.counted, scene.batch
-        regions = scene.encoding.objectness_logit.numel()
-        known = regions if counted is None else int(counted.sum())
-        there = scene.assignment.assigned
-        found.append(
-            ImageTerms(
-                {name: float(value) for name, value in result.terms.items()},
-                float(result.loss),
-                known,
-                regions - known,
-                int(there.sum()),
-                int((there & (batch.category[k : k + 1] >= 0)).sum()),
-                int((there & one.has_viewpoint).sum()),
-                int((there & scene.assignment.has_range).sum()),
-                int((there & one.has_voxels).sum()),
+    with evaluation_mode(model):
+        for k in range(len(batch.image)):
+            scene = model.guide.observe(batch[k : k + 1])
+            result = elbo.evaluate(model.story, model.guide, scene, scenes=1, decode=decode)
+            counted, one = scene.assignment.counted, scene.batch
+            regions = scene.encoding.objectness_logit.numel()
+            known = regions if counted is None else int(counted.sum())
+            there = scene.assignment.assigned
+            found.append(
+                ImageTerms(
+                    {name: float(value) for name, value in result.terms.items()},
+                    float(result.loss),
+                    known,
+                    regions - known,
+                    int(there.sum()),
+                    int((there & (batch.category[k : k + 1] >= 0)).sum()),
+                    int((there & one.has_viewpoint).sum()),
+                    int((there & scene.assignment.has_range).sum()),
+                    int((there & one.has_voxels).sum()),
+                )
             )
-        )
-    for module in training:
-        module.training = True
     return found

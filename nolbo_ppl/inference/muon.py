@@ -53,7 +53,7 @@ class MuonAdamW(torch.optim.Optimizer):
         module: what is trained; parameters that require no gradient are left out.
         lr: rate of both.
         weight_decay: decoupled, of matrices and kernels.
-        pace: rate of Muon's matrices over that of the others.
+        matrix_lr_scale: rate of Muon's matrices over that of the others.
     """
 
     def __init__(self, module: nn.Module, lr: float, weight_decay: float, matrix_lr_scale: float = 1.0) -> None:

@@ -6,7 +6,7 @@ The generative model reads labels and responsible regions alone; encoding and po
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -88,6 +88,12 @@ class RegionParameters:
             box_scale=self.box_scale * by,
             range_scale=self.range_scale * by,
         )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[RegionParameters]) -> RegionParameters:
+        """Regions of several batches, one after the other."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> RegionParameters:
         """Apply a function to every tensor."""

@@ -42,7 +42,10 @@ def contexts_of(guide: HybridGuide, images: Iterable[UInt8[np.ndarray, "h w 3"]]
 
 
 def fit_domain(guide: HybridGuide, context: Float[Tensor, "n c"], generated: Bool[Tensor, " n"]) -> dict[str, float]:
-    """Fit classifier and shift scores; returns held-out figures. Nothing is fitted with fewer than `MIN_IMAGES` of a kind.
+    """Fit classifier and shift scores. Nothing is fitted with fewer than `MIN_IMAGES` of a kind.
+
+    Returns what every fourth image says, which no weight was fitted to. Those images also set the border and the scale of the
+    scores, so that the figures tell whether the fit went wrong, not how well it does on images of other sources.
 
     Args:
         guide: receives them.

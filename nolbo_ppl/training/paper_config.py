@@ -117,7 +117,7 @@ class PaperConfig:
     first_rate: float = 1e-5
     """`multi`: learning rate of the first epoch."""
     decode: int = 16
-    """Objects decoded a step; their term stands for all."""
+    """`single`, `multi`: objects decoded a step; their term stands for all."""
     augment: bool = True
     """Blur, colours, scale and translation at random."""
     mirror: bool = True

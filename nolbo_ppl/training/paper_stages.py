@@ -34,7 +34,7 @@ from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.io.tensors import check_tensors, load_tensors, save_tensors
 from nolbo_ppl.metrics.voxel import voxel_average_precision, voxel_iou
 from nolbo_ppl.models.classifiers import PictureClassifier
-from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observation_model import Nolbo, evaluation_mode
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.progress import progress_bar
@@ -341,7 +341,7 @@ def _scenes(config: PaperConfig, device: torch.device, rank: int, world: int) ->
             supply, step = loader(chosen), start
             while True:
                 if single and len(chosen) > 1:  # crops of another side each step
-                    supply.crop = chosen[int(np.random.default_rng([config.seed, step, 3]).integers(len(chosen)))]
+                    supply.crop = chosen[int(np.random.default_rng([config.seed, step, 4]).integers(len(chosen)))]
                 yield supply.batch(step)
                 step += 1
 
@@ -413,25 +413,22 @@ def _rows(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
 def voxel_precision(model: Nolbo, batches: Iterator[SceneBatch]) -> dict[str, float]:
     """Average precision of the voxels that the latent of each held-out object decodes to, at its responsible region: `voxel_map`,
     the mean over categories of the means over objects. Empty without known shapes."""
-    training = [module for module in model.modules() if module.training]
-    model.eval()
     device, of_category = next(model.parameters()).device, {}  # type: ignore[var-annotated]
-    for batch in batches:
-        batch = placed(batch, device)
-        scene = model.guide.observe(batch)
-        mask = scene.assignment.assigned & batch.has_voxels & (batch.category >= 0)
-        if not bool(mask.any()):
-            continue
-        q = scene.posterior.map(partial(_rows, mask)).at_map_category(model.story.prior.label_mean())
-        probability = torch.sigmoid(model.story.decoder(q.shape_loc)).float().cpu().numpy()
-        truth = unpack_voxels(batch.voxels[mask].cpu().numpy(), model.config.voxel_size)
-        solid = truth.any(axis=(1, 2, 3))
-        for label, value in zip(
-            batch.category[mask].cpu().numpy()[solid], voxel_average_precision(probability[solid], truth[solid])
-        ):
-            of_category.setdefault(int(label), []).append(float(value))
-    for module in training:
-        module.training = True
+    with evaluation_mode(model):
+        for batch in batches:
+            batch = placed(batch, device)
+            scene = model.guide.observe(batch)
+            mask = scene.assignment.assigned & batch.has_voxels & (batch.category >= 0)
+            if not bool(mask.any()):
+                continue
+            q = scene.posterior.map(partial(_rows, mask)).at_map_category(model.story.prior.label_mean())
+            probability = torch.sigmoid(model.story.decoder(q.shape_loc)).float().cpu().numpy()
+            truth = unpack_voxels(batch.voxels[mask].cpu().numpy(), model.config.voxel_size)
+            solid = truth.any(axis=(1, 2, 3))
+            for label, value in zip(
+                batch.category[mask].cpu().numpy()[solid], voxel_average_precision(probability[solid], truth[solid])
+            ):
+                of_category.setdefault(int(label), []).append(float(value))
     return {"voxel_map": float(np.mean([np.mean(values) for values in of_category.values()]))} if of_category else {}
 
 

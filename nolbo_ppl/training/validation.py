@@ -14,7 +14,7 @@ from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.geometry.rotation import geodesic_angle, viewpoint_to_matrix
 from nolbo_ppl.inference.elbo import INCLUSIVE, PURE_BOUND, SceneELBO
 from nolbo_ppl.models.guide import orientation_posterior
-from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.observation_model import Nolbo, evaluation_mode
 from nolbo_ppl.models.observed_scene import ObservedScene
 from nolbo_ppl.models.scene_batch import SceneBatch, decode_box
 
@@ -29,25 +29,22 @@ def validate(model: Nolbo, batches: Iterable[SceneBatch], decode: int = 16) -> d
     `med_err_deg` (objects of categories without declared symmetry), `azimuth_in_90` (share of true azimuths inside the
     90 % region). `left_out` is the share of objects that no region is responsible for.
     """
-    training = [module for module in model.modules() if module.training]  # a frozen part stays in evaluation mode
-    model.eval()
     sums: dict[str, float] = {}
     scenes = objects = left_out = 0
     found: dict[str, list[torch.Tensor]] = {name: [] for name in ("box50", "category", "error", "region")}
     device = next(model.parameters()).device
-    for batch in batches:
-        batch = placed(batch, device)
-        scene = model.guide.observe(batch)
-        scenes += len(batch.image)
-        objects, left_out = objects + int(batch.present.sum()), left_out + int(scene.left_out.sum())
-        for prefix, weights in (("bound", PURE_BOUND), ("inclusive", INCLUSIVE)):
-            terms = SceneELBO(weights).evaluate(model.story, model.guide, scene, decode=decode).terms
-            for name, value in terms.items():
-                key = f"{prefix}/{name.removesuffix('_inclusive')}"
-                sums[key] = sums.get(key, 0.0) + float(value)
-        _collect(model, scene, found)
-    for module in training:
-        module.training = True
+    with evaluation_mode(model):
+        for batch in batches:
+            batch = placed(batch, device)
+            scene = model.guide.observe(batch)
+            scenes += len(batch.image)
+            objects, left_out = objects + int(batch.present.sum()), left_out + int(scene.left_out.sum())
+            for prefix, weights in (("bound", PURE_BOUND), ("inclusive", INCLUSIVE)):
+                terms = SceneELBO(weights).evaluate(model.story, model.guide, scene, decode=decode).terms
+                for name, value in terms.items():
+                    key = f"{prefix}/{name.removesuffix('_inclusive')}"
+                    sums[key] = sums.get(key, 0.0) + float(value)
+            _collect(model, scene, found)
     result = {name: value / max(scenes, 1) for name, value in sums.items()}
     result["left_out"] = left_out / max(objects, 1)
     result["bound"] = sum(value for name, value in result.items() if name.startswith("bound/"))

@@ -23,6 +23,7 @@ from nolbo_ppl.models.baselines.single_object import BOX_SHARE, crop_objects, on
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.observed_scene import ObservedScene
+from nolbo_ppl.models.posterior_calibration import CERTAIN, Calibration
 from nolbo_ppl.models.scene_batch import decode_range, encode_range, unpack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.training.calibrate import about_mean, calibrate
@@ -297,11 +298,29 @@ def test_boxes_of_single_objects_are_those_of_the_image() -> None:
     (none,) = seen.observe_boxes([image], [80.0, 80.0, 48.0, 32.0], [np.zeros((0, 4))], decode=False)
     assert len(none) == 0
     many = box + np.arange(6)[:, None]
-    (few,), (all_at_once,) = (
-        seen.observe_boxes([image], [80.0, 80.0, 48.0, 32.0], [many], decode=False, batch=batch) for batch in (1, 16)
-    )
+    (few,), (all_at_once,) = (seen.observe_boxes([image], [80.0, 80.0, 48.0, 32.0], [many], batch=batch) for batch in (1, 16))
     np.testing.assert_allclose(few.latent, all_at_once.latent, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(few.viewpoint_modes.azimuth, all_at_once.viewpoint_modes.azimuth, rtol=1e-3, atol=1e-3)
+    assert few.voxel_mean is not None and all_at_once.voxel_mean is not None  # samples do not depend on the batch either
+    np.testing.assert_allclose(few.voxel_mean, all_at_once.voxel_mean, rtol=1e-3, atol=1e-3)
+
+
+def test_single_objects_are_as_certain_as_the_detector_and_bad_images_are_refused() -> None:
+    """No head of this model says where objects are, so its own limit of certainty has no say."""
+    torch.set_default_dtype(torch.float32)
+    model = Nolbo.from_seed(tiny_config(method="single"), 0)
+    detector = ObservationModel(Nolbo.from_seed(tiny_config(), 1))
+    seen = SingleObjectModel(model, Calibration(objectness_limit=0.5), detector)
+    image, camera = np.random.default_rng(0).integers(0, 256, (64, 96, 3), dtype=np.uint8), [80.0, 80.0, 48.0, 32.0]
+    found, own = (one.observe(image, camera, threshold=1e-3, decode=False) for one in (seen, detector))
+    assert len(found) > 0
+    np.testing.assert_allclose(found.objectness, own.objectness)
+    box = [np.array([[10.0, 12.0, 50.0, 44.0]])]
+    (given,) = seen.observe_boxes([image], camera, box, decode=False)
+    assert given.objectness == pytest.approx([CERTAIN])
+    for picture, lens in ((image.astype(float), camera), (image[..., 0], camera), (image, [0.0, 80.0, 48.0, 32.0])):
+        with pytest.raises(InputError, match=r"an image|intrinsics"):
+            seen.observe_boxes([picture], lens, box)
 
 
 def test_scatter_about_the_mean_of_views() -> None:

@@ -63,18 +63,21 @@ def test_the_numbers_behind_detections_are_found(informative: bool) -> None:
         assert fit.look_share < 0.15
 
 
-def test_a_look_that_misleads_has_no_share() -> None:
-    found, photos = drawn(600, False, seed=3)
-    category = np.array([p.category[0] if len(p.category) else -1 for p in photos])
-    look = np.full((600, LABELS), -4.0)
-    hit = category >= 0
-    sure = hit & (np.arange(600) % 4 > 0)
-    look[sure, category[sure]] = 0.0
-    other = hit & ~sure  # wrong and certain in a quarter: likelihood wants a small share, precision loses by it or gains
-    look[other, (category[other] + 1) % LABELS] = 0.0
-    fit = fit_found(FoundObjects(found.scene, found.box, found.log_odds, found.own, look), photos)
-    assert fit is not None
-    assert (fit.look_share > 0) == (fit.map50_with_look > fit.map50_without_look)
+@pytest.mark.parametrize("gain", [-0.1, 0.0, 0.1])
+def test_a_look_without_a_gain_in_precision_has_no_share(gain: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Likelihood wants a share of this look; precision decides, and without one the other weight is the look's absence's."""
+    precision = iter([0.5, 0.5 + gain])
+    monkeypatch.setattr(photograph_fit, "mean_precision", lambda *_: next(precision))
+    found, photos = drawn(600, True, seed=3)
+    fit = fit_found(found, photos)
+    assert fit is not None and (fit.map50_without_look, fit.map50_with_look) == (0.5, 0.5 + gain)
+    assert (fit.look_share > 0.3) == (gain > 0)
+    if gain <= 0:
+        *_, category = judged(found, photos, found.own.argmax(1))
+        rows = category >= 0
+        grid = np.linspace(0.05, 2.0, 400)
+        loss = [-photograph_fit._normalised(a * found.own[rows])[np.arange(rows.sum()), category[rows]].mean() for a in grid]
+        assert fit.look_share == 0.0 and fit.label_factor == pytest.approx(grid[int(np.argmin(loss))], abs=0.01)
 
 
 def test_what_is_not_labelled_is_not_judged() -> None:

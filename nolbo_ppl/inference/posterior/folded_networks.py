@@ -176,7 +176,8 @@ class FoldedNetworks:
 
     def _follow(self) -> None:
         """Make the networks, if any weight was written or replaced since they were made."""
-        parts = [*self.model.guide.parameters(), *self.model.story.decoder.parameters(), *self.model.guide.buffers()]
+        networks = (self.model.guide, self.model.story.decoder)
+        parts = [tensor for network in networks for tensor in (*network.parameters(), *network.buffers())]
         if any(one.device.type != "cpu" for one in parts):
             self._state, self._guide, self._decoder = None, self.model.guide, self.model.story.decoder
             return

@@ -69,13 +69,14 @@ def load(
     if stated is not None and stated != file_hash(weights):
         expected = f"SHA-256 {stated}, as config.json says"
         raise input_error("weights were changed", got=file_hash(weights), expected=expected, file=weights)
-    if config.detector:  # models of before these were: nothing is known of shifts and sizes
-        fresh = Nolbo.from_seed(config, seed=0).state_dict()
-        tensors = {**{name: value for name, value in fresh.items() if name.startswith(LEARNT_LATER)}, **tensors}
     with torch.device("meta"):  # shapes alone: a configuration of networks beyond any memory does not fit its weights
-        check_tensors(Nolbo(config).state_dict(), {name: t.to("meta") for name, t in tensors.items()}, weights)
+        own = Nolbo(config).state_dict()
+        missing = {name for name in own if name.startswith(LEARNT_LATER) and name not in tensors}
+        needed = {name: value for name, value in own.items() if name not in missing}
+        check_tensors(needed, {name: t.to("meta") for name, t in tensors.items()}, weights)
     model = Nolbo.from_seed(config, seed=0)
-    load_strictly(model, tensors, weights)
+    fresh = model.state_dict()  # models of before these were: nothing is known of shifts and sizes
+    load_strictly(model, {**tensors, **{name: fresh[name] for name in missing}}, weights)
     model.set_half_precision(half_precision)
     model.to(target)
     if config.description.one_object:  # the shipped scene network says where objects are

@@ -203,6 +203,7 @@ def export_onnx(
         "latent_dim": config.latent_dim,
         "voxel_size": config.voxel_size,
         "one_region_an_object": not config.detector,
+        "objectness_limit": plain.calibration.objectness_limit,
         "prior_mean": plain.prior_mean().tolist(),
         "guide_inputs": names,
         "inputs": {

@@ -22,7 +22,7 @@ from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape, decode_la
 from nolbo_ppl.inference.posterior.folded_networks import FoldedNetworks
 from nolbo_ppl.inference.posterior.metric_size import MetricKnowledge, shape_hulls
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
-from nolbo_ppl.inference.posterior.preprocess import PreprocessedImage, preprocess_all, same_shape
+from nolbo_ppl.inference.posterior.preprocess import PreprocessedImage, as_sequence, preprocess_all, same_shape
 from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guessed_intrinsics
 from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.image_shift import ODDS_PER_SHIFT, SCALE_PER_SHIFT, excess
@@ -128,8 +128,7 @@ class ObservationModel:
         Raises:
             InputError: an image or its intrinsics cannot be used.
         """
-        single = (isinstance(images, np.ndarray) and images.ndim == 3) or (isinstance(images, Tensor) and images.dim() == 3)
-        sequence: list[Any] = [images] if single else list(images)  # type: ignore[list-item]
+        sequence, single = as_sequence(images)
         prepared = self._preprocess_all(sequence, intrinsics, size)
         if not 0 < threshold < 1:
             raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
@@ -223,6 +222,8 @@ class ObservationModel:
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
             for k, i in enumerate(group):
                 one = answer[slice(ends[k], ends[k + 1])]
+                if encoding.generated is not None:  # of generated scenes the guide's own range is left alone
+                    one = replace(one, sized=bool(encoding.generated[k] < 0.5))
                 results[i] = one if shift is None else replace(one, shift=float(shift[k]))
         return [results[i] for i in range(len(prepared))]
 

@@ -46,16 +46,14 @@ def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "
     return np.array([focal, focal, width / 2, height / 2])
 
 
-def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> PreprocessedImage:
-    """Scale an image uniformly so that its longer side has the wanted size; grey bars make both multiples of 32.
+def as_sequence(images: Any) -> tuple[list[Any], bool]:
+    """Images as a list, and whether one alone was given."""
+    single = (isinstance(images, np.ndarray) and images.ndim == 3) or (isinstance(images, Tensor) and images.dim() == 3)
+    return ([images] if single else list(images)), single
 
-    The rule of training (`nolbo_ppl.data.dataset_folder.letterbox`), with bars on the right and below: pixels keep their place.
 
-    Args:
-        image: see `Image`.
-        intrinsics: [fx, fy, cx, cy] in px of the given image; guessed when None.
-        size: longer side of the scaled image, px.
-        dtype: of the scaled intrinsics.
+def checked(image: Any, intrinsics: Any) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, " 4"]]:
+    """An image as an array, and its camera [fx, fy, cx, cy], px, guessed when None.
 
     Raises:
         InputError: no image, a tiny one, or intrinsics of no camera.
@@ -69,11 +67,29 @@ def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torc
     if min(height, width) < MIN_SIDE:
         raise input_error("an image", got=f"{width} x {height} px", expected=f"at least {MIN_SIDE} x {MIN_SIDE} px")
     if intrinsics is None:
-        camera = guessed_intrinsics(image)
-    else:
-        camera = np.asarray(intrinsics, dtype=np.float64)
-        if camera.shape != (4,) or not np.isfinite(camera).all() or (camera[:2] <= 0).any():
-            raise input_error("intrinsics", got=intrinsics, expected="[fx, fy, cx, cy] in px with positive fx, fy")
+        return image, guessed_intrinsics(image)
+    camera = np.asarray(intrinsics, dtype=np.float64)
+    if camera.shape != (4,) or not np.isfinite(camera).all() or (camera[:2] <= 0).any():
+        raise input_error("intrinsics", got=intrinsics, expected="[fx, fy, cx, cy] in px with positive fx, fy")
+    return image, camera
+
+
+def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> PreprocessedImage:
+    """Scale an image uniformly so that its longer side has the wanted size; grey bars make both multiples of 32.
+
+    The rule of training (`nolbo_ppl.data.dataset_folder.letterbox`), with bars on the right and below: pixels keep their place.
+
+    Args:
+        image: see `Image`.
+        intrinsics: [fx, fy, cx, cy] in px of the given image; guessed when None.
+        size: longer side of the scaled image, px.
+        dtype: of the scaled intrinsics.
+
+    Raises:
+        InputError: see `checked`.
+    """
+    image, camera = checked(image, intrinsics)
+    height, width = image.shape[:2]
     factor = size / max(height, width)
     new = [max(1, round(side * factor)) for side in (width, height)]
     if [width, height] != new:

@@ -11,11 +11,12 @@ import torch
 
 import nolbo_ppl
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.posterior.model_folder import FORMAT, load, save
+from nolbo_ppl.inference.posterior.model_folder import FORMAT, LEARNT_LATER, load, save
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.tensors import file_hash, load_tensors, save_tensors
+from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.posterior_calibration import Calibration
-from tests.factories import instance_config, tiny_model
+from tests.factories import instance_config, tiny_config, tiny_model
 
 CAMERA = [70.0, 70.0, 32.0, 32.0]
 
@@ -120,3 +121,18 @@ def test_the_format_of_the_weights_is_read(tmp_path: Path) -> None:
         save_tensors(tmp_path / "model.safetensors", tensors, {"format": stated})
         with pytest.raises(InputError, match=r"model.safetensors: a model of another format: .*update nolbo_ppl"):
             load(tmp_path)
+
+
+def test_models_of_before_shifts_and_sizes_load_with_nothing_known(tmp_path: Path) -> None:
+    torch.set_default_dtype(torch.float32)
+    model = Nolbo.from_seed(tiny_config(detector="yolox_nano"), 0)
+    older = {name: value for name, value in model.state_dict().items() if not name.startswith(LEARNT_LATER)}
+    assert len(older) < len(model.state_dict())
+    save(tmp_path, model, Calibration(), {})
+    tensors, meta = load_tensors(tmp_path / "model.safetensors")
+    save_tensors(tmp_path / "model.safetensors", {name: tensors[name] for name in older}, meta)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps({**config, "sha256": None}))
+    found = load(tmp_path, "cpu").model.state_dict()
+    assert not any(bool(found[name].any()) for name in ("guide.shift.inverse_span", "guide.sizes.precision"))
+    assert all(torch.equal(found[name], value) for name, value in older.items())

@@ -99,7 +99,7 @@ def test_the_page_runs_without_torch(tmp_path: Path, capsys: pytest.CaptureFixtu
     torch.set_default_dtype(torch.float32)
     (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     config = tiny_config()
-    save(tmp_path / "own", tiny_model(config, scatter=0.3).float(), Calibration(objectness_shift=3.0), {})
+    save(tmp_path / "own", tiny_model(config, scatter=0.3).float(), Calibration(objectness_shift=3.0, objectness_limit=0.9), {})
     main(["export", "--model", str(tmp_path / "own"), "--out", str(tmp_path / "exported"), "--candidates", "32"])
     assert "guide.onnx" in capsys.readouterr().out
     image = np.random.default_rng(5).integers(0, 256, (96, 160, 3), dtype=np.uint8)

@@ -18,12 +18,13 @@ from nolbo_ppl.inference.posterior.decode import position_covariance
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.preprocess import preprocess
 from nolbo_ppl.models.guide import orientation_posterior
+from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import cell_of, decode_box, decode_range
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
-from tests.factories import instance_config, tiny_model
+from tests.factories import instance_config, tiny_config, tiny_model
 
 CAMERA = [70.0, 74.0, 33.0, 29.0]
 
@@ -466,3 +467,18 @@ def test_without_intrinsics_sixty_degrees_are_assumed() -> None:
     focal = 32 / math.tan(math.radians(30))
     options: dict[str, Any] = {"threshold": 0.5, "decode": False}
     assert_same(model.observe(image, **options), model.observe(image, [focal, focal, 32, 32], **options))
+
+
+@pytest.mark.parametrize("generated", [False, True])
+def test_answers_say_whether_a_height_is_in_their_ranges(generated: bool) -> None:
+    """In photographs it is, in generated scenes and for models that know no photographs it is not."""
+    model = tiny_model(tiny_config(detector="yolox_nano"), scatter=0.3)
+    assert isinstance(model.guide, HybridGuide)
+    with torch.no_grad():
+        model.guide.fusion.domain.weight.zero_()
+        model.guide.fusion.domain.bias.fill_(30.0 if generated else -30.0)
+    box = np.array([[10.0, 12.0, 50.0, 44.0]])
+    (seen,) = ObservationModel(model).observe_boxes([picture()], CAMERA, [box], decode=False)
+    assert seen.sized is not generated and seen[:1].sized is seen.sized
+    (plain,) = observer().observe_boxes([picture()], CAMERA, [box], decode=False)
+    assert plain.sized is False
