@@ -241,9 +241,3 @@ def slam_table(config: ReproduceConfig) -> ResultTable:
         title = "VO" if name == "vo" else NETWORKS[name].title
         table.add(title, [*cells, ATE[name], RPE[name], round(ATE[name] / ATE["vo"], 3)])
     return table
-
-
-def order_of(table: ResultTable) -> list[str]:
-    """Rows by their ATE, best first."""
-    values = [(cells[0].value, name) for name, cells in table.rows if not isinstance(cells[0], str) and cells[0] is not None]
-    return [name for value, name in sorted(v for v in values if v[0] is not None)]

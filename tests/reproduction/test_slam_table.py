@@ -13,8 +13,7 @@ from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 from nolbo_ppl.reproduction.budgets import ReproduceConfig
 from nolbo_ppl.reproduction.estep_time import simulated_state, time_e_step
-from nolbo_ppl.reproduction.result_table import ResultTable
-from nolbo_ppl.reproduction.slam_table import Drive, odometry_of, order_of, paths, score_odometry, true_objects
+from nolbo_ppl.reproduction.slam_table import Drive, odometry_of, paths, score_odometry, true_objects
 from nolbo_ppl.structures.detections import Detections
 
 
@@ -56,13 +55,6 @@ def test_paths_of_a_folder(tmp_path: Path) -> None:
         step = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)))
         distance = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
         assert (distance[np.abs(step[:, None] - step) > 100] < 2.0).any()
-
-
-def test_rows_by_their_error() -> None:
-    table = ResultTable("T", ("ATE, m",))
-    for name, value in (("a", 3.0), ("b", 1.0), ("c", 2.0)):
-        table.add(name, [value])
-    assert order_of(table) == ["b", "c", "a"]
 
 
 def test_the_e_step_is_timed() -> None:
