@@ -115,3 +115,10 @@ def test_no_rims_without_a_picture() -> None:
 def test_pixels_that_no_ray_reaches_are_refused() -> None:
     with pytest.raises(InputError, match="pixel that the distortion model cannot undo: got"):
         undistort_points(np.array([[5000.0, 240.0]]), CAMERA, "radial-tangential", (-0.28, 0.0, 0.0, 0.0))
+
+
+def test_depth_that_is_no_number_is_unknown() -> None:
+    depth = np.full((48, 64), 2.0)
+    depth[20:24, 30:34] = [np.inf, -np.inf, np.nan, np.inf]
+    found = undistort_depth(depth, CAMERA / 10, "radial-tangential", (0.0, 0.0, 0.0, 0.0))
+    assert set(np.unique(found)) == {0.0, 2.0} and (found == 0).sum() == 16
