@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from sessions import interval
 
 from nolbo_ppl.data.simulate import (
     DetectorConfig,
@@ -102,14 +103,6 @@ def measure(drive: SimulatedSequence) -> dict[str, float]:
         )
         row["scale_error"] = float(np.sqrt(np.mean((stated / np.maximum(true, 1e-9) - 1) ** 2)))
     return row
-
-
-def interval(values: list[float]) -> str:
-    """Mean and its 95 % interval, worlds resampled."""
-    rng = np.random.default_rng(0)
-    x = np.array(values)
-    low, high = np.quantile(x[rng.integers(len(x), size=(2000, len(x)))].mean(axis=1), [0.025, 0.975])
-    return f"{x.mean():.3f} [{low:.3f}, {high:.3f}]"
 
 
 def main(arguments: Arguments) -> None:

@@ -164,11 +164,11 @@ def main(arguments: Arguments) -> None:
             write_json(arguments.out, done)
             print(key, " ".join(f"{name} {value:.3f}" for name, value in done[key].items()), flush=True)
     rows = [done[key] for key in keys if key in done]
-    joined = [row for row in rows if row["joined"] and row["common"] and not row["wrong"]]
     common = [row for row in rows if row["common"]]
+    joined = [row for row in common if row["joined"]]  # wrong ones too: what they state is judged with the rest
     print(f"pairs {len(rows)}, seconds each {np.mean([row['seconds'] for row in rows]):.1f}")
     print("wrong merges          ", share(sum(int(row.get("wrong", 0.0)) for row in rows), len(rows)))
-    print("common places found   ", share(len(joined), len(common)))
+    print("common places found   ", share(sum(not row["wrong"] for row in joined), len(common)))
     if not joined:
         return
     for name in (

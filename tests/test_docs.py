@@ -151,6 +151,12 @@ def test_python_blocks_run_in_order(page: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
 
 
+def test_every_benchmark_is_listed() -> None:
+    scripts = [path for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text(encoding="utf-8")]
+    text = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    assert scripts and not [path.name for path in scripts if path.name not in text]
+
+
 def test_json_blocks_are_json() -> None:
     for page in PAGES:
         for text in blocks(page, "json"):
