@@ -91,8 +91,7 @@ class ForeignDetections:
 
 def is_whole(box: Float[np.ndarray, "n 4"], size: Sequence[float] | Float[np.ndarray, " 2"]) -> Bool[np.ndarray, " n"]:
     """Boxes that keep away from the rim of an image of this width and height, px; false for NaN."""
-    inside: np.ndarray = (box[:, :2] > RIM).all(axis=1) & (box[:, 2:] < np.asarray(size) - RIM).all(axis=1)
-    return inside
+    return np.logical_and((box[:, :2] > RIM).all(axis=1), (box[:, 2:] < np.asarray(size) - RIM).all(axis=1))
 
 
 @dataclass
