@@ -115,3 +115,61 @@ def make_pix3d(root: Path, rows: list[dict[str, Any]]) -> Path:
         model.write_text("\n".join(lines) + "\n")
     (root / "pix3d.json").write_text(json.dumps(rows))
     return root
+
+
+BOP_CAMERA = np.array([[100.0, 0, 47.5], [0, 110.0, 39.0], [0, 0, 1]])
+"""K of every image of `make_bop`: pixel centres at whole numbers."""
+
+
+def bop_truth(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """cam_R_m2c and cam_t_m2c (mm) of the one object of an image: seen from the front, turned further in every image."""
+    angle = 0.3 * number
+    upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the model's z is the camera's -y
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return upright @ turn, np.array([40.0 * number - 60, 20.0, 900.0 + 50 * number])
+
+
+def make_bop(root: Path, images: int = 3, split: str = "test", scene: int = 48, camera: str = "camera_uw.json") -> Path:
+    """One scene of a box (object 2) off the origin of its model; boxes by projecting its points, as BOP's tools make them."""
+    low, size = np.array([-30.0, -20.0, 5.0]), np.array([120.0, 60.0, 200.0])
+    (root / "models").mkdir(parents=True, exist_ok=True)
+    stated = dict(zip(("min_x", "min_y", "min_z", "size_x", "size_y", "size_z"), [*low.tolist(), *size.tolist()]))
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0]).flatten().tolist()
+    upside_down = np.diag([1.0, -1.0, -1.0, 1.0]).flatten().tolist()
+    info = {
+        "1": {**stated, "diameter": 250.0, "symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]},
+        "2": {**stated, "diameter": 250.0, "symmetries_discrete": [half_turn, upside_down]},
+    }
+    (root / "models" / "models_info.json").write_text(json.dumps(info))
+    for number in (1, 2):
+        corners = [low + size * (i, j, k) for k in (0, 1) for j in (0, 1) for i in (0, 1)]
+        faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+        head = ["ply", "format ascii 1.0", "element vertex 8", *(f"property float {axis}" for axis in "xyz"), "element face 6"]
+        lines = [*head, "property list uchar int vertex_indices", "end_header", *(f"{a} {b} {c}" for a, b, c in corners)]
+        lines += [f"4 {' '.join(map(str, face))}" for face in faces]
+        (root / "models" / f"obj_{number:06d}.ply").write_text("\n".join(lines) + "\n")
+    (root / camera).write_text("{}")
+    folder = root / split / f"{scene:06d}"
+    truth, cameras, about = {}, {}, {}
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 41)] * 3), -1).reshape(-1, 3)
+    for number in range(1, images + 1):
+        picture(folder / "rgb" / f"{number:06d}.png", seed=number)
+        R, t = bop_truth(number)
+        points = (low + size * grid) @ R.T + t
+        pixels = np.round(points / points[:, 2:] @ BOP_CAMERA.T)[:, :2].astype(int)
+        corner, extent = pixels.min(0), pixels.max(0) - pixels.min(0)
+        box = [*corner.tolist(), *extent.tolist()]
+        depth = np.full((80, 96), round((t[2] + 2.5) / 0.1), dtype=np.uint16)  # a wall through the object, steps of 0.1 mm
+        (folder / "depth").mkdir(exist_ok=True)
+        Image.fromarray(depth).save(folder / "depth" / f"{number:06d}.png")
+        truth[str(number)] = [{"obj_id": 2, "cam_R_m2c": R.flatten().tolist(), "cam_t_m2c": t.tolist()}]
+        turn = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # the world's x is forward, its z up
+        centre = np.array([100.0 * number, 2000.0, 1500.0])
+        cameras[str(number)] = {
+            "cam_K": BOP_CAMERA.flatten().tolist(), "depth_scale": 0.1, "cam_R_w2c": turn.flatten().tolist(),
+            "cam_t_w2c": (-turn @ centre).tolist(),
+        }  # fmt: skip
+        about[str(number)] = [{"bbox_obj": box, "bbox_visib": box, "visib_fract": 1.0, "px_count_all": 9}]
+    for name, content in (("scene_gt", truth), ("scene_camera", cameras), ("scene_gt_info", about)):
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    return root

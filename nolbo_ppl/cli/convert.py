@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from nolbo_ppl.cli.convert_archives import Coco, ObjectNet3d, Pascal3d, Pix3d, StanfordCars, Voc
+from nolbo_ppl.cli.convert_archives import Bop, Coco, ObjectNet3d, Pascal3d, Pix3d, StanfordCars, Voc
 from nolbo_ppl.data.converters import (
     Converted,
     convert_kitti_object,
@@ -250,6 +250,7 @@ Source = (
     | Annotated[Photographs, tyro.conf.subcommand("photographs")]
     | Annotated[PseudoLabels, tyro.conf.subcommand("pseudo-labels")]
     | Annotated[YcbvSlam, tyro.conf.subcommand("ycbv-slam")]
+    | Annotated[Bop, tyro.conf.subcommand("bop")]
     | Annotated[Pascal3d, tyro.conf.subcommand("pascal3d")]
     | Annotated[ObjectNet3d, tyro.conf.subcommand("objectnet3d")]
     | Annotated[Voc, tyro.conf.subcommand("voc")]
@@ -260,7 +261,7 @@ Source = (
 
 
 DRIVE = ("odometry.txt", "truth.txt", COVARIANCE, "observations.jsonl", "objects.json", "source.json")
-SCENES = ("images", "scenes.jsonl", "voxels.npz", "source.json")
+SCENES = ("images", "scenes.jsonl", "voxels.npz", "trajectories", "source.json")
 """Files of what is converted."""
 
 

@@ -12,11 +12,15 @@ import tyro
 
 from nolbo_ppl.categories import PAPER_CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage, write_archive
+from nolbo_ppl.data.converters.bop import MINIMUM_VISIBILITY, read_bop, read_targets, write_bop
+from nolbo_ppl.data.converters.bop_models import model_files
 from nolbo_ppl.data.converters.coco import read_coco
 from nolbo_ppl.data.converters.pascal3d import cad_files, read_objectnet3d, read_pascal3d
 from nolbo_ppl.data.converters.pix3d import pix3d_models, read_pix3d
 from nolbo_ppl.data.converters.stanford_cars import read_stanford_cars
 from nolbo_ppl.data.converters.voc import read_voc
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.text import read_words
 from nolbo_ppl.synthetic.assets.voxel_cache import cached_voxels_of
 from nolbo_ppl.training.train_config import DEFAULT_CACHE
 
@@ -179,3 +183,43 @@ class StanfordCars:
         source = {"archive": "Stanford Cars", "annotations": self.annotations.name}
         images = read_stanford_cars(self.annotations, self.images, only_present=self.only_present)
         return written(write_archive(self.out, images, source))
+
+
+@dataclass(frozen=True)
+class Bop:
+    """A data set in the layout of BOP, such as YCB-Video: rigid objects with their models and true poses, as scenes."""
+
+    data: Path
+    """Folder with models/, test/ and the like."""
+    out: Path
+    """Folder for images/, scenes.jsonl, voxels.npz, trajectories/, source.json."""
+    split: str = "test"
+    """Folder of the scenes: test, train_real, train_pbr, ..."""
+    targets: Path | None = None
+    """Only the images of this list (`test_targets_bop19.json`)."""
+    every: int = 1
+    """Only every this many images of a scene."""
+    names: Path | None = None
+    """Names of the objects, one a line, from number 1 on; YCB-Video's where the folder is it, else obj_000001 and so on."""
+    minimum_visibility: float = MINIMUM_VISIBILITY
+    """Objects of which less is seen are regions to ignore."""
+    shapes: Annotated[Shapes, tyro.conf.arg(name="")] = Shapes()
+    """How its models are filled."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        if self.every < 1:
+            raise input_error("every", got=self.every, expected="at least 1")
+        names = None if self.names is None else [" ".join(words) for _, words in read_words(self.names)]
+        targets = None if self.targets is None else read_targets(self.targets)
+        files = model_files(self.data, names)
+        filled = cached_voxels_of(files, self.shapes.grid, self.shapes.cache, self.shapes.workers)
+        images = read_bop(
+            self.data,
+            self.split,
+            names=names,
+            targets=targets,
+            every=self.every,
+            minimum_visibility=self.minimum_visibility,
+        )
+        return written(write_bop(self.out, images, {"archive": self.data.resolve().name, "split": self.split}, filled))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.converters.foreign_detections import DetectionFormat, ForeignDetections, read_foreign_detections
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.data.format_registry import LIKELY, POSSIBLE, SURE, FormatReport, LabelledPicture, Look, register, spread
@@ -18,6 +19,7 @@ from nolbo_ppl.data.sequences.opening import IMAGE_FOLDERS
 from nolbo_ppl.data.sequences.video import VIDEO_SUFFIXES
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.camera_files import read_camera
+from nolbo_ppl.io.files import read_jsonl
 from nolbo_ppl.io.images import IMAGE_SUFFIXES, image_size, is_passed_over, open_image
 from nolbo_ppl.io.landmarks import read_landmarks
 from nolbo_ppl.io.npz import Npz
@@ -26,6 +28,7 @@ from nolbo_ppl.io.ros_bags import IMAGES, READ, Bag, looks_like_bag, split_topic
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory
 from nolbo_ppl.io.trajectory_documents import is_colmap
 from nolbo_ppl.synthetic.assets.cad import load_mesh
+from nolbo_ppl.synthetic.dataset_writer import SCENES
 
 LOOKED_AT = 300
 """Images whose headers are read; of more, so many evenly."""
@@ -317,10 +320,20 @@ def _box_lines(look: Look) -> float:
 register("box-lines", "boxes or masks alone, JSON Lines", _box_lines)(_detections("box-lines", "lines"))
 
 
+def stated_categories(path: Path) -> tuple[str, ...]:
+    """Names of the categories in a folder of scenes: the library's where they are these, else those that occur, sorted."""
+    found: set[str] = set()
+    for _, row in read_jsonl(path if path.name == SCENES else path / SCENES):
+        objects, listed = row.get("objects"), row.get("exhaustive")
+        names = [thing.get("category") for thing in objects if isinstance(thing, dict)] if isinstance(objects, list) else []
+        found |= {name for name in (*names, *(listed if isinstance(listed, list) else ())) if isinstance(name, str)}
+    return CATEGORIES if found <= set(CATEGORIES) else tuple(sorted(found))
+
+
 @register("scenes", "labelled scenes", lambda look: SURE if "scenes.jsonl" in look.names else 0.0)
 def report_scenes(path: Path) -> FormatReport:
     """Images, objects, categories, shapes."""
-    folder = SceneFolder(path)
+    folder = SceneFolder(path, stated_categories(path))
     names = [name for record in folder.records for name in record.category]
     facts: dict[str, Any] = {"images": len(folder), "objects": len(names), "instances": len(folder.instances)}
     facts["categories"] = dict(Counter(str(name) for name in names).most_common())

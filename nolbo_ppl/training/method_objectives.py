@@ -1,4 +1,4 @@
-"""Weights of the terms by method, and the loss of the method that has a discriminator."""
+"""Weights of the terms by method, and the losses of methods that have a discriminator or a phase of joint learning."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.elbo import SHAPE_STAGE, ElboResult
 from nolbo_ppl.models.baselines.adversary import adversarial_terms
 from nolbo_ppl.models.baselines.method import METHODS, MethodName
+from nolbo_ppl.models.normalisation import world_size
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch, unpack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
@@ -85,6 +87,52 @@ class AdversarialLoss(nn.Module):
         terms = {name: share * value for name, value in terms.items()}
         added = torch.stack([self.weights.get(name, 0.0) * value for name, value in terms.items()]).sum()
         return ElboResult({**result.terms, **terms}, result.loss - added / scenes)
+
+
+class JointLoss(nn.Module):
+    """The TL-network's third phase: both of its networks learn together (Girdhar et al. 2016, section 3.3).
+
+    The latent of an image and that of its shape, as the 3D encoder gives it now, are drawn to each other, and the shape's is
+    decoded to the shape itself.
+
+    Args:
+        loss: loss of scenes, whose truth of the shape latent is the 3D encoder's.
+        model: the networks.
+        weight: weight of the voxels.
+    """
+
+    def __init__(self, loss: nn.Module, model: Nolbo, weight: float) -> None:
+        super().__init__()
+        self.loss, self.shape_guide, self.decoder = loss, model.shape_guide, model.story.decoder
+        self.weight, self.size = weight, model.config.voxel_size
+
+    def forward(self, batch: SceneBatch, decode: int | None = None) -> ElboResult:
+        """The loss of scenes less the weighted voxels a scene; `voxels` stands for all known shapes, of which `decode` are
+        decoded."""
+        known = (batch.present & batch.has_voxels).flatten().nonzero().squeeze(-1)
+        if not len(known) and world_size() == 1:
+            return self.loss(batch, decode=0)
+        packed = batch.voxels.flatten(0, 1)[known]
+        loc, scale = self.shape_guide.posterior(packed)
+        result = self.loss(batch.replace(**_targets(batch, known, loc, scale)), decode=0)
+        order = torch.arange(len(known), device=known.device)
+        if batch.decode_order is not None:
+            order = batch.decode_order.flatten()[known].argsort(stable=True)
+        chosen = order if decode is None else order[:decode]
+        truth = unpack_bits(packed[chosen], self.size).to(loc.dtype)
+        share = len(known) / max(len(chosen), 1)
+        voxels = -share * binary_cross_entropy_with_logits(self.decoder(loc[chosen]), truth, reduction="sum")
+        return ElboResult({**result.terms, "voxels": voxels}, result.loss - self.weight * voxels / len(batch.image))
+
+
+def _targets(batch: SceneBatch, known: Tensor, loc: Tensor, scale: Tensor) -> dict[str, Tensor]:
+    """Latents of the batch's shapes with those of some objects in place of the batch's own."""
+    found = {}
+    for name, value in (("shape_loc", loc), ("shape_scale", scale)):
+        own = getattr(batch, name)
+        own = loc.new_ones(*batch.present.shape, loc.shape[-1]) if own is None else own
+        found[name] = own.flatten(0, 1).index_put((known,), value.to(own.dtype)).view_as(own)
+    return found
 
 
 def _true_shapes(batch: SceneBatch | ShapeBatch, decode: int | None) -> tuple[Tensor, Tensor, float, int]:

@@ -25,7 +25,7 @@ from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
 from nolbo_ppl.synthetic.worlds.world_views import ViewConfig, ViewSource
 from nolbo_ppl.training.scene_loader import ConcatScenes, MixedSceneLoader, SceneLoader, SceneSubset, ShapeTable
-from nolbo_ppl.training.stages import DECODE_STREAM, seeded_noise
+from nolbo_ppl.training.stages import DECODE_STREAM, JOINT, seeded_noise
 from nolbo_ppl.training.train_config import TrainConfig
 
 VALIDATION_SEED = 1000
@@ -175,6 +175,8 @@ class TrainingData:
 
             return each_pinned(shapes(), self.device)
         seed = 3 * config.seed + (1 if stage == "single" else 2)  # one for all parts: they choose the same size
+        if stage == JOINT:  # on from where the scenes ended
+            start += config.scene_steps - config.joint_steps
 
         def loader_of(scenes: BatchedScenes, table: ShapeTable, batch: int) -> SceneLoader:
             return SceneLoader(

@@ -18,11 +18,13 @@ from nolbo_ppl.models.normalisation import set_joint
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.models.shape_vae import ShapeBatch
-from nolbo_ppl.training.method_objectives import ADVERSARIAL_TERMS, AdversarialLoss, image_weights
+from nolbo_ppl.training.method_objectives import ADVERSARIAL_TERMS, AdversarialLoss, JointLoss, image_weights
 
 OBJECTIVES: dict[str, Mapping[str, float]] = {"inclusive": INCLUSIVE, "elbo": PURE_BOUND, "paper": PAPER}
 """Weights of the terms by the name of the objective."""
 
+JOINT = "joint"
+"""Name of the stage on scenes in which the shape autoencoder learns along (`JointLoss`)."""
 DECODE_STREAM = 2**40
 """Added to a step's number, it gives the random numbers that choose which objects are decoded."""
 
@@ -32,7 +34,7 @@ class TrainingStage:
     """One stage: what is trained, on which terms, for how long."""
 
     name: str
-    """`shapes`, `single` or `scenes`."""
+    """`shapes`, `single`, `scenes` or `joint`."""
     optimisation: OptimizerConfig
     """Optimiser and schedule."""
     weights: Mapping[str, float]
@@ -80,13 +82,17 @@ class StageRun:
             model.guide.requires_grad_(False)
             module: nn.Module = ShapeLoss(model, SceneELBO(weights))
         else:
-            model.shape_guide.requires_grad_(False)
+            joint = stage.name == JOINT
+            model.shape_guide.requires_grad_(joint)
             if stage.freeze >= stage.optimisation.steps:
                 model.story.requires_grad_(False)
             if stage.freeze_encoder:
                 model.guide.encoder.requires_grad_(False)
+            rebuilt = weights.pop("voxels", 0.0) if joint else 0.0
             module = SceneLoss(model.story, model.guide, SceneELBO(weights))
-        if len(weights) < len(stage.weights):
+            if joint:
+                module = JointLoss(module, model, rebuilt)
+        if not {*ADVERSARIAL_TERMS}.isdisjoint(stage.weights):
             module = AdversarialLoss(module, model, stage.weights)
         together = distributed.is_available() and distributed.is_initialized()
         self._local = together and average_every > 1
@@ -101,7 +107,7 @@ class StageRun:
         if self._frozen != frozen or not self.model.training:
             self.model.train()
             if self.stage.name != "shapes":
-                self.model.shape_guide.eval()
+                self.model.shape_guide.train(self.stage.name == JOINT)
                 self.model.story.train(not frozen)
                 for parameter in self.model.story.parameters():
                     parameter.requires_grad_(not frozen)

@@ -16,9 +16,9 @@ from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.svi import OptimizerConfig
 from nolbo_ppl.models.baselines.method import METHODS, MethodName
 from nolbo_ppl.models.model_config import PRESETS, ModelConfig
-from nolbo_ppl.training.method_objectives import shape_weights
+from nolbo_ppl.training.method_objectives import DECODED, shape_weights
 from nolbo_ppl.training.net2net import grown_config
-from nolbo_ppl.training.stages import TrainingStage, scene_weights
+from nolbo_ppl.training.stages import JOINT, TrainingStage, scene_weights
 
 DEFAULT_CACHE = Path("~/.cache/nolbo_ppl")
 """Where rendered scenes are kept between runs."""
@@ -38,7 +38,7 @@ FREE_FIELDS = (
     "prefetch",
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
-NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False}
+NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False, "joint": 0.25}
 """Fields that a checkpoint need not name where they have these values, for the same reason as `OPTIONAL_FIELDS`."""
 OPTIONAL_FIELDS = (
     "categories",
@@ -138,6 +138,9 @@ class TrainConfig:
     """Steps on scenes."""
     freeze: float = 1.0
     """Share of the scene steps during which decoder and prior networks stay frozen."""
+    joint: float = 0.25
+    """`--method tlnet`: share of the scene steps, at the end, that are its third phase, in which the shape autoencoder learns
+    along."""
     decode: int = 12
     """Objects decoded a step where the objective has voxels; their term stands for all objects."""
     weights: dict[str, float] = field(default_factory=dict)
@@ -256,6 +259,8 @@ class TrainConfig:
             raise input_error("weights", got=self.weights, expected="finite numbers of at least 0")
         if not 0 <= self.freeze <= 1:
             raise input_error("freeze", got=self.freeze, expected="a share from 0 to 1")
+        if not 0 <= self.joint <= 1:
+            raise input_error("joint", got=self.joint, expected="a share from 0 to 1")
         if any(size % 32 or size <= 0 for size in self.sizes):
             raise input_error("sizes", got=self.sizes, expected="positive multiples of 32")
         if self.grow and self.initial is None:
@@ -326,6 +331,11 @@ class TrainConfig:
             changes["latent_dim"] = self.latent_dim
         return dataclasses.replace(PRESETS[self.preset](), **changes)
 
+    @property
+    def joint_steps(self) -> int:
+        """Steps of the phase in which the shape autoencoder learns along; none of methods without it."""
+        return round(self.joint * self.scene_steps) if METHODS[self.method].joint else 0
+
     def _symmetry(self) -> tuple[int, ...]:
         """Declared symmetry of each of `categories`."""
         return self.symmetry or tuple(CATEGORY_SYMMETRY.get(name, 1) for name in self.categories)
@@ -335,6 +345,8 @@ class TrainConfig:
         weights = scene_weights(self.objective, self.weights, self.method)
         decoded = METHODS[self.method].decoded  # the decoder learns along
         images = OptimizerConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
+        joint = self.joint_steps
+        alone = self.scene_steps - joint
         stages = [
             TrainingStage(
                 "shapes",
@@ -351,11 +363,18 @@ class TrainConfig:
             ),
             TrainingStage(
                 "scenes",
-                dataclasses.replace(images, steps=self.scene_steps, warmup=min(100, self.scene_steps)),
+                dataclasses.replace(images, steps=alone, warmup=min(100, alone)),
                 weights,
-                freeze=0 if decoded else round(self.freeze * self.scene_steps),
+                freeze=0 if decoded else round(self.freeze * alone),
                 freeze_encoder=self.freeze_encoder,
                 decode=self.decode if weights.get("voxels") else 0,
+            ),
+            TrainingStage(
+                JOINT,
+                dataclasses.replace(images, steps=joint, warmup=min(100, joint)),
+                {**weights, "voxels": weights.get("voxels", DECODED)},
+                freeze_encoder=self.freeze_encoder,
+                decode=self.decode,
             ),
         ]
         return [stage for stage in stages if stage.optimisation.steps > 0]

@@ -40,7 +40,7 @@ from nolbo_ppl.training.model_card import write_card
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.photograph_fit import PARTS, PhotographFit, adopt_fit, find_objects, fit_found
 from nolbo_ppl.training.stage_data import TrainingData
-from nolbo_ppl.training.stages import StageRun
+from nolbo_ppl.training.stages import JOINT, StageRun
 from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
 from nolbo_ppl.training.training_log import TrainingLogger, run_folder
 from nolbo_ppl.training.validation import validate
@@ -218,7 +218,10 @@ def _train_stage(
                 training_logger.log(name, info, scenes, time.perf_counter() - start, waited)
                 bar.set_postfix(loss=f"{info.loss:.3f}")
             if name != "shapes" and at % config.evaluate_every == 0 and at < steps and training_logger.rank == 0:
-                figures = validate(stage_run.averaged(), data.validation(config.evaluate_scenes))
+                averaged = stage_run.averaged()
+                if name == JOINT:
+                    data.encode_shapes(averaged)
+                figures = validate(averaged, data.validation(config.evaluate_scenes))
                 training_logger.write({"stage": name, "step": at, **figures})
             if at % config.checkpoint_every == 0 and at < steps:
                 training_logger.checkpoint(number, stage_run)

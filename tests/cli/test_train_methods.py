@@ -37,11 +37,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("method", ["single", "tlnet", "vaegan"])
 def test_a_method_trains_and_observes(method: MethodName, folder: Path, tmp_path: Path) -> None:
-    options = "--preset nano --batch 4 --shape-batch 4 --shape-steps 2 --single-steps 1 --scene-steps 2 --log-every 1 --threads 1"
+    options = "--preset nano --batch 4 --shape-batch 4 --shape-steps 2 --single-steps 1 --scene-steps 4 --log-every 1 --threads 1"
     out = tmp_path / "run"
     main(["train", "--method", method, "--scenes", str(folder), "--out", str(out), "--no-bf16", *options.split()])
     rows = [row for _, row in read_jsonl(out / "metrics.jsonl")]
-    assert [row["step"] for row in rows if row["stage"] == "scenes" and "loss" in row] == [1, 2]
+    steps = {name: [row["step"] for row in rows if row["stage"] == name and "loss" in row] for name in ("scenes", "joint")}
+    assert steps == {"scenes": [1, 2, 3, 4], "joint": []} if method != "tlnet" else {"scenes": [1, 2, 3], "joint": [1]}
     assert all(np.isfinite(row["loss"]) for row in rows if "loss" in row)
     assert any("terms/generator" in row for row in rows) == METHODS[method].adversary
     model = load(out / "model")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.stats import chi2
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.inference.elbo import SceneELBO
+from nolbo_ppl.inference.elbo import SceneELBO, SceneLoss
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.inference.posterior.single_object_predictor import SingleObjectModel
 from nolbo_ppl.inference.svi import OptimizerConfig
@@ -28,7 +29,7 @@ from nolbo_ppl.models.scene_batch import decode_range, encode_range, unpack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.training.calibrate import about_mean, calibrate
 from nolbo_ppl.training.detector_file import adopt_features
-from nolbo_ppl.training.method_objectives import AdversarialLoss, image_weights, shape_weights
+from nolbo_ppl.training.method_objectives import AdversarialLoss, JointLoss, image_weights, shape_weights
 from nolbo_ppl.training.stages import OBJECTIVES, StageRun, TrainingStage, scene_weights
 from nolbo_ppl.training.train_config import TrainConfig
 from tests.factories import random_batch, tiny_config, tiny_model
@@ -83,6 +84,55 @@ def test_the_tl_network_is_drawn_to_the_shape() -> None:
     (gradient,) = torch.autograd.grad(-terms["shape_inclusive"], point)
     assert scene.batch.shape_loc is not None
     torch.testing.assert_close(gradient, (point - scene.batch.shape_loc) * seen(scene)[..., None])
+
+
+def test_the_tl_networks_third_phase() -> None:
+    """By hand: half the squared distance of the two points, weighted, and the cross-entropy of the shape's own decoded point;
+    its gradient reaches both networks, and the table's older latents have no say."""
+    config = tiny_config(method="tlnet")
+    model, batch = tiny_model(config, scatter=0.5).eval(), random_batch(config, 2, 3)
+    weights = {"shape_inclusive": 0.75}
+    loss = JointLoss(SceneLoss(model.story, model.guide, SceneELBO(weights)), model, 0.01)
+    assert batch.shape_loc is not None
+    result = loss(batch.replace(shape_loc=batch.shape_loc + 7.0), decode=None)
+    scene = model.guide.observe(batch)
+    mask, known = seen(scene), batch.present & batch.has_voxels
+    own, _ = model.shape_guide.posterior(batch.voxels[mask])
+    distance = 0.5 * (scene.posterior.shape_loc[mask] - own).square().sum()
+    every, _ = model.shape_guide.posterior(batch.voxels[known])
+    truth = unpack_bits(batch.voxels[known], 32).double()
+    entropy = binary_cross_entropy_with_logits(model.story.decoder(every), truth, reduction="sum")
+    torch.testing.assert_close(-result.terms["shape_inclusive"], distance)
+    torch.testing.assert_close(-result.terms["voxels"], entropy)
+    torch.testing.assert_close(result.loss, (0.75 * distance + 0.01 * entropy) / 2)
+    result.loss.backward()
+    for part in (model.guide.encoder, model.shape_guide, model.story.decoder):
+        assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in part.parameters())
+    few = loss(batch, decode=1).terms["voxels"]
+    first = torch.where(known, batch.decode_order, torch.inf).flatten().argmin()  # type: ignore[arg-type]
+    one, _ = model.shape_guide.posterior(batch.voxels.flatten(0, 1)[first][None])
+    logits = model.story.decoder(one)
+    alone = binary_cross_entropy_with_logits(
+        logits, unpack_bits(batch.voxels.flatten(0, 1)[first][None], 32).double(), reduction="sum"
+    )
+    torch.testing.assert_close(-few, int(known.sum()) * alone)
+    nothing = loss(batch.replace(has_voxels=torch.zeros_like(batch.has_voxels)), decode=2)
+    assert "voxels" not in nothing.terms and float(nothing.terms["shape_inclusive"].detach()) == 0.0
+
+
+def test_the_third_phase_moves_both_networks() -> None:
+    """Scenes leave the shape autoencoder alone, the third phase moves it; steps are those of the other methods in all."""
+    config = TrainConfig(method="tlnet", scene_steps=8, single_steps=0, decode=4)
+    stages = {stage.name: stage for stage in config.stages()}
+    assert [stages[name].optimisation.steps for name in ("scenes", "joint")] == [6, 2]
+    assert "joint" not in {stage.name for stage in TrainConfig(method="ae").stages()}
+    assert [stage.name for stage in TrainConfig(method="tlnet", joint=0.0, single_steps=0).stages()] == ["shapes", "scenes"]
+    model = tiny_model(tiny_config(method="tlnet"))
+    for name, moved in (("scenes", set()), ("joint", {"shape_guide", "story.decoder"})):
+        before = {key: value.clone() for key, value in model.named_parameters()}
+        run = StageRun(model, replace(stages[name], optimisation=QUICK, freeze=3 if name == "scenes" else 0))
+        losses = [run.step(random_batch(model.config, 2, 3)).loss for _ in range(3)]
+        assert prefixes(model, before) == {"guide.encoder", "guide.head"} | moved and np.isfinite(losses).all()
 
 
 def test_adversarial_terms() -> None:

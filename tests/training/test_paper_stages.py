@@ -27,9 +27,10 @@ from nolbo_ppl.models.classifiers import (
     classification_terms,
     predicted_viewpoint,
 )
-from nolbo_ppl.training import paper_stages
+from nolbo_ppl.training import paper_loop, paper_stages, scene_stages
 from nolbo_ppl.training.paper_config import PaperConfig
-from nolbo_ppl.training.paper_stages import run_paper, voxel_precision
+from nolbo_ppl.training.paper_stages import run_paper
+from nolbo_ppl.training.scene_stages import voxel_precision
 from tests.archive_layouts import make_imagenet, make_modelnet, make_pascal, make_rendered
 from tests.factories import random_batch, tiny_config, tiny_model
 
@@ -152,9 +153,9 @@ def test_a_phase_ends_at_its_accuracy(tmp_path: Path, monkeypatch: pytest.Monkey
         ]
     )
     reached = iter([0.5, 0.71, 0.2, 0.9, 0.9, 0.9])
-    monkeypatch.setattr(paper_stages, "validate", lambda *_: {})
-    monkeypatch.setattr(paper_stages, "voxel_precision", lambda *_: {"voxel_map": next(reached)})
-    monkeypatch.setattr(paper_stages, "calibrate", lambda *_: paper_stages.Calibration())
+    monkeypatch.setattr(scene_stages, "validate", lambda *_: {})
+    monkeypatch.setattr(scene_stages, "voxel_precision", lambda *_: {"voxel_map": next(reached)})
+    monkeypatch.setattr(paper_loop, "calibrate", lambda *_: paper_loop.Calibration())
     run_paper(
         options("single", tmp_path / "scenes", tmp_path / "run", steps=6, evaluate_every=1, decode=0, weights={"voxels": 0.0})
     )

@@ -14,6 +14,8 @@ import numpy as np
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.data.converters.archives import ArchiveImage
+from nolbo_ppl.data.converters.bop import BopImage, looks_like_bop, read_bop, splits
+from nolbo_ppl.data.converters.bop_models import read_models
 from nolbo_ppl.data.converters.pascal3d import read_objectnet3d, read_pascal3d, read_record
 from nolbo_ppl.data.converters.pix3d import read_pix3d
 from nolbo_ppl.data.converters.voc import read_voc, read_voc_annotation
@@ -85,6 +87,54 @@ labelled(
     lambda look: SURE if {"Annotations", "JPEGImages"} <= look.names else 0.0,
     lambda path: read_voc(path),
 )
+
+
+@register("bop", "a data set in the layout of BOP", lambda look: SURE if looks_like_bop(look.names, look.path) else 0.0)
+def report_bop(path: Path) -> FormatReport:
+    """Splits, images, objects by name, visible shares, and whether depth images fit the poses."""
+    models = read_models(path)
+    found = {split: list(read_bop(path, split, minimum_visibility=0.0)) for split in splits(path)}
+    images = [image for part in found.values() for image in part]
+    names = Counter(str(name) for image in images for name in image.annotations.category)
+    facts: dict[str, Any] = {"models": len(models), "images": len(images), "objects": sum(names.values())}
+    facts["splits"] = {split: len(part) for split, part in found.items()}
+    facts["scenes"] = len({(split, image.scene) for split, part in found.items() for image in part})
+    facts["categories"] = dict(names.most_common())
+    shares = np.concatenate([image.annotations.visibility for image in images]) if images else np.zeros(0)
+    facts["visible"] = [round(float(v), 4) for v in np.quantile(shares, [0, 0.5, 1])] if len(shares) else []
+    facts["poses_of_cameras"] = sum(image.T_world_camera is not None for image in images)
+    facts["depth_images"] = sum(image.depth is not None for image in images)
+    problems, off = [], []
+    with_depth = [image for image in images if image.depth is not None]
+    for k in spread(len(with_depth)):
+        try:
+            off += depth_misfits(with_depth[k])
+        except InputError as error:
+            problems.append(str(error))
+    if off:
+        facts["depth_misfit"] = round(float(np.median(off)), 3)
+        if facts["depth_misfit"] > 1:
+            problems.append(f"depth images miss the objects by {facts['depth_misfit']} of their diagonals: depth_scale?")
+
+    def pictures() -> Iterator[LabelledPicture]:
+        for k in spread(len(images)):
+            one = images[k].annotations
+            assert one.file is not None
+            labels = tuple(str(name) for name in one.category)
+            yield LabelledPicture(one.file.name, open_image(one.file), one.box, labels)
+
+    return FormatReport("bop", "a data set in the layout of BOP", facts, tuple(problems), pictures=pictures)
+
+
+def depth_misfits(image: BopImage) -> list[float]:
+    """How far the depth in the middle of each object's box lies from its centre, in its diagonals, where most of it is seen."""
+    depth, labels = image.depth_in_metres(), image.annotations
+    if depth is None:
+        return []
+    middle = ((labels.box[:, :2] + labels.box[:, 2:]) / 2).astype(int)
+    rows = np.flatnonzero((labels.visibility > 0.9) & (middle < [depth.shape[1], depth.shape[0]]).all(1))
+    off = np.abs(depth[middle[rows, 1], middle[rows, 0]] - labels.position[rows, 2]) / labels.diagonal[rows]
+    return off[np.isfinite(off)].tolist()
 
 
 def _xml_folder(look: Look) -> float:

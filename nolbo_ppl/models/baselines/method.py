@@ -39,6 +39,8 @@ class Method:
     """Says category and viewpoint of an object."""
     one_object: bool = False
     """Sees crops of one object each, whose boxes another detector gives."""
+    joint: bool = False
+    """Ends with a phase in which the shape autoencoder learns along."""
     adversary: bool = False
     """A discriminator tells decoded samples of the prior from true shapes."""
 
@@ -48,7 +50,7 @@ METHODS: dict[MethodName, Method] = {
     "single": Method("NOLBOSingle", label_prior=True, point=False, decoded=False, describes=True, one_object=True),
     "ae": Method("AE", label_prior=False, point=True, decoded=True, describes=False),
     "vvae": Method("vVAE", label_prior=False, point=False, decoded=True, describes=False),
-    "tlnet": Method("TLNet", label_prior=False, point=True, decoded=False, describes=False),
+    "tlnet": Method("TLNet", label_prior=False, point=True, decoded=False, describes=False, joint=True),
     "vaegan": Method("3D-VAE-GAN", label_prior=False, point=False, decoded=True, describes=False, adversary=True),
 }
 """Every method by the name that options use."""
