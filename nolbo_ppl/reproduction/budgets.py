@@ -90,6 +90,9 @@ class ReproduceConfig:
     """How much is computed: `small` is minutes a network on two cores."""
     seeds: int = 1
     """Networks of each kind, trained and measured from so many seeds; intervals are over them."""
+    trained: int = 0
+    """Networks of each kind that are trained, where they are to be fewer than `seeds`: seeds of `table2` share them in turn, and
+    its intervals are over the odometry's noise above all. 0 for one a seed."""
     networks: tuple[str, ...] = ()
     """Names of the networks to compare; all of them by default."""
     weights: dict[str, str] = field(default_factory=dict)
@@ -103,6 +106,8 @@ class ReproduceConfig:
     """Processes that render scenes."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.trained <= self.seeds:
+            raise input_error("trained", got=self.trained, expected=f"0 to {self.seeds}, the seeds")
         if self.seeds < 1 or self.workers < 1:
             raise input_error("seeds or workers", got=(self.seeds, self.workers), expected="at least 1")
         unknown = sorted({*self.networks, *self.weights} - set(NETWORKS))
@@ -120,6 +125,16 @@ class ReproduceConfig:
     def folder(self) -> Path | None:
         """The folder of data, None for generated data."""
         return None if self.data == "generated" else Path(self.data)
+
+    @property
+    def networks_of_each(self) -> int:
+        """How many networks of each kind are trained."""
+        return self.trained or self.seeds
+
+    def label(self, name: str, seed: int) -> str:
+        """What files of a network are called; weights that were given are others than those trained here."""
+        given = f"-{Path(self.weights[name]).name}" if name in self.weights else ""
+        return f"{name}{given}-{seed % self.networks_of_each}"
 
     def chosen(self, among: tuple[str, ...]) -> tuple[str, ...]:
         """The networks to compare among some, in their order."""

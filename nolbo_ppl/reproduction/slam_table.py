@@ -17,6 +17,7 @@ from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve
 from nolbo_ppl.inference.slam.map_files import association_table
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.io.npz import Npz, save_npz
+from nolbo_ppl.io.observations import read_observations, write_observations
 from nolbo_ppl.io.trajectories import read_trajectory
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.trajectory import trajectory_errors
@@ -130,6 +131,14 @@ def observe_drive(model: ObservationModel, drive: Drive, batch: int = 16) -> Det
     return Detections.concatenate(tables)
 
 
+def observations_of(config: ReproduceConfig, drive: Drive, name: str, seed: int, model: ObservationModel) -> Detections:
+    """What a network observes of a drive, kept in a file that later calls read."""
+    file = config.out / "observations" / config.budget / f"{drive.name}-{config.label(name, seed)}.jsonl"
+    if not file.is_file():
+        write_observations(file, observe_drive(model, drive))
+    return read_observations(file)
+
+
 def true_objects(detections: Detections, drive: Drive) -> Int[np.ndarray, " n"]:
     """True object of each detection by the overlap of boxes, -1 for none."""
     out = np.full(len(detections), -1)
@@ -191,14 +200,16 @@ def score_slam(drive: Drive, odometry: Float[np.ndarray, "n 4 4"], detections: D
 
 def scores_of(config: ReproduceConfig, drive: Drive, name: str, seed: int) -> DriveScores:
     """Scores of a network, or of the odometry (`vo`), kept in a file that a later call reads."""
-    file = config.out / "slam" / config.budget / f"{drive.name}-{name}-{seed}.json"
+    network = "vo" if name == "vo" else config.label(name, seed)
+    file = config.out / "slam" / config.budget / f"{drive.name}-{network}-{seed}.json"
     if not file.is_file():
         odometry = odometry_of(drive, seed)
         if name == "vo":
             scores = score_odometry(drive, odometry)
         else:
-            model = trained(config, name, seed)
-            scores = score_slam(drive, odometry, observe_drive(model, drive), model.calibration.shape_correlation)
+            model = trained(config, name, seed % config.networks_of_each)
+            seen = observations_of(config, drive, name, seed, model)
+            scores = score_slam(drive, odometry, seen, model.calibration.shape_correlation)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, {key: None if np.isnan(value) else value for key, value in vars(scores).items()})
     return DriveScores(**{key: np.nan if value is None else float(value) for key, value in read_json(file).items()})
@@ -221,8 +232,8 @@ def slam_table(config: ReproduceConfig) -> ResultTable:
             "paper: ATE over VO",
         ),
         f"Generated drives {length}; odometry with {ROTATION_SCALE:g} rad and {100 * TRANSLATION_RATIO:g} % of white noise; "
-        f"means over the drives, intervals over {config.seeds} seeds of networks and odometry. The paper gives no units. "
-        f"Budget {config.budget}.",
+        f"means over the drives, intervals over {config.seeds} seeds of the odometry; networks of each kind: "
+        f"{config.networks_of_each}. The paper gives no units. Budget {config.budget}.",
     )
     odometry = [[scores_of(config, drive, "vo", seed) for drive in drives] for seed in range(config.seeds)]
     for name in (*config.chosen(IN_SLAM), "vo"):

@@ -52,10 +52,10 @@ def viewpoint_table(config: ReproduceConfig) -> ResultTable:
         "Viewpoints with ground truth boxes (Table 1)",
         ("measure", *PAPER_CATEGORIES, "mean"),
         "Acc: share within 30 degrees; MedErr: median geodesic error, degrees, up to the symmetry of a shape where it is known. "
-        f"Data: {config.data}, budget {config.budget}, {config.seeds} seeds.",
+        f"Data: {config.data}, budget {config.budget}, {config.networks_of_each} seeds.",
     )
     for name in config.chosen(("multi16", "multi128", "single16")):
-        found = [answers(config, name, seed) for seed in range(config.seeds)]
+        found = [answers(config, name, seed) for seed in range(config.networks_of_each)]
         for measure, row in (("Acc", accuracy_row(found)), ("MedErr", median_row(found))):
             table.add(f"{NETWORKS[name].title}, here", [measure, *row])
     for measure, paper in (("Acc", ACCURACY), ("MedErr", MEDIAN_ERROR)):
@@ -122,13 +122,13 @@ def reconstruction(config: ReproduceConfig) -> tuple[ResultTable, dict[str, Prec
         ("AP", "voxel IoU", "AP of chair, sofa", "IoU of chair, sofa"),
         "AP: area under precision and recall of occupancy over all voxels of all objects, at true boxes, in the canonical pose. "
         "The paper shows a curve without numbers, of its 3D-VAE-GAN for bench, chair and sofa only. "
-        f"Data: {config.data}, budget {config.budget}, {config.seeds} seeds.",
+        f"Data: {config.data}, budget {config.budget}, {config.networks_of_each} seeds.",
     )
     curves: dict[str, PrecisionRecall] = {}
     some = [CATEGORIES.index(name) for name in OF_VAE_GAN]
     for name in config.chosen(tuple(NETWORKS)):
         figures = []
-        for seed in range(config.seeds):
+        for seed in range(config.networks_of_each):
             found = answers(config, name, seed)
             part = found.select(np.isin(found.category, some))
             curve = precision_recall(found.occupied, found.empty)
@@ -162,13 +162,13 @@ def latent_maps(config: ReproduceConfig) -> tuple[ResultTable, dict[str, tuple[n
         ("5 nearest neighbours", "maximum likelihood"),
         "Share of objects whose five nearest neighbours in the latent space are most often of their own category, and of "
         "those whose category is that of the nearest prior mean (networks with a label-conditioned prior). "
-        f"Data: {config.data}, budget {config.budget}, {config.seeds} seeds.",
+        f"Data: {config.data}, budget {config.budget}, {config.networks_of_each} seeds.",
     )
     maps: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     shown: list[int] = []
     for name in config.chosen(tuple(NETWORKS)):
         nearest, likeliest = [], []
-        for seed in range(config.seeds):
+        for seed in range(config.networks_of_each):
             found = answers(config, name, seed)
             found = found.select(found.category >= 0)
             shown = shown or list(categories_shown(found.category, SHOWN, np.random.default_rng(0)))

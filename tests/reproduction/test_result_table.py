@@ -63,6 +63,7 @@ def test_options_of_reproductions(tmp_path: Path) -> None:
     assert ReproduceConfig(tmp_path, networks=("ae16", "multi16")).chosen(("multi16", "vvae16", "ae16")) == ("multi16", "ae16")
     for changes, message in (
         ({"seeds": 0}, "seeds"),
+        ({"seeds": 2, "trained": 3}, "trained"),
         ({"networks": ("gan",)}, "unknown networks"),
         ({"weights": {"gan": "tiny"}}, "unknown networks"),
         ({"data": str(tmp_path / "none")}, "no such folder"),

@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +36,7 @@ from nolbo_ppl.training.paper_stages import run_paper
 from nolbo_ppl.training.scene_stages import voxel_precision
 from tests.archive_layouts import make_imagenet, make_modelnet, make_pascal, make_rendered
 from tests.factories import random_batch, tiny_config, tiny_model
+from tests.paper_worker import programme
 
 NARROW = 1 / 64
 
@@ -249,3 +253,39 @@ def test_the_command_refuses_a_folder_of_something_else(tmp_path: Path, capsys: 
     with pytest.raises(SystemExit) as stop:
         main(["train", "--stage", "imagenet", "--data", str(tmp_path), "--out", str(tmp_path / "run"), "--device", "cpu"])
     assert stop.value.code == 2 and "not a folder of ImageNet" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_two_processes_of_torchrun_learn_what_one_does(tmp_path: Path) -> None:
+    """Pictures, shapes, single objects and scenes in two processes, which die in the third step of the last stage and go on:
+    the networks of one process with the joint batch."""
+    data = tmp_path / "data"
+    make_imagenet(data / "imagenet")
+    make_modelnet(data / "ModelNet40")
+    make_pascal(data / "pascal")
+    for split in ("train", "val"):
+        convert = ["convert", "pascal3d", "--data", str(data / "pascal"), "--out", str(data / split), "--split", split]
+        main([*convert, "--grid", "64", "--cache", str(tmp_path / "cache")])
+    programme(data, tmp_path / "one")
+    worker = Path(__file__).resolve().parents[1] / "paper_worker.py"
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(worker)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def run(*stop: str) -> subprocess.CompletedProcess[str]:
+        arguments = [*launch, str(data), str(tmp_path / "two"), *stop]
+        return subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=400)
+
+    killed = run("3")
+    assert killed.returncode != 0 and "exitcode  : 3" in killed.stderr, killed.stderr[-2000:]
+    assert (
+        not (tmp_path / "two" / "multi" / "model").exists() and (tmp_path / "two" / "multi" / "checkpoint.safetensors").exists()
+    )
+    done = run()
+    assert done.returncode == 0, done.stderr[-2000:]
+    for name in ("imagenet/core", "vae/model/model", "single/model/model", "multi/model/model"):
+        one, two = (load_file(tmp_path / side / f"{name}.safetensors") for side in ("one", "two"))
+        assert one.keys() == two.keys()
+        for key, value in one.items():
+            assert torch.allclose(two[key], value, rtol=1e-3, atol=1e-4), (name, key, float((two[key] - value).abs().max()))
+    steps = [row["step"] for row in rows(tmp_path / "two" / "multi") if "loss" in row]
+    assert steps == [1, 2, 3, 4]

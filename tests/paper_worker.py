@@ -1,0 +1,66 @@
+"""Stages of the paper's programme one after the other, as `torchrun ... tests/paper_worker.py DATA OUT [STOP]` runs them.
+
+The tests call `programme` themselves, in one process, to compare with. With STOP, every process dies in that step of the last
+stage.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch
+
+from nolbo_ppl.training.paper_config import PaperConfig
+from nolbo_ppl.training.paper_stages import run_paper
+from nolbo_ppl.training.stages import StageRun
+
+CATEGORIES = ("car", "chair")
+
+
+def stages(data: Path, out: Path) -> list[PaperConfig]:
+    """Pictures, shapes, crops of single objects, whole scenes; every network a 64th as wide."""
+    common: dict[str, Any] = {
+        "width": 1 / 64, "steps": 4, "batch": 4, "bf16": False, "device": "cpu", "workers": 1, "log_every": 1,
+        "evaluate_every": 100, "checkpoint_every": 2, "cache": out / "cache", "latent_dim": 4, "threads": 1,
+    }  # fmt: skip
+    scenes: dict[str, Any] = {"categories": CATEGORIES, "sizes": (32, 64), "decode": 3, "validation": data / "val"}
+    return [
+        PaperConfig("imagenet", data / "imagenet", out / "imagenet", sizes=(32,), **common),
+        PaperConfig("vae", data / "ModelNet40", out / "vae", **common),
+        PaperConfig(
+            "single", data / "train", out / "single", core=out / "imagenet", decoder=out / "vae", phases=(32,), phase_steps=2,
+            **scenes, **common,
+        ),
+        PaperConfig("multi", data / "train", out / "multi", initial=out / "single", freeze_epochs=1, **scenes, **common),
+    ]  # fmt: skip
+
+
+def programme(data: Path, out: Path) -> None:
+    """Run them all; what is done already is gone on with."""
+    for config in stages(data, out):
+        run_paper(config)
+
+
+def main() -> None:
+    """Run, or die on the way."""
+    data, out = Path(sys.argv[1]), Path(sys.argv[2])
+    torch.set_num_threads(1)
+    if len(sys.argv) > 3:
+        original, last = StageRun.step, int(sys.argv[3])
+
+        def dying(self: StageRun, batch: Any) -> Any:
+            if self.stage.name == "scenes" and self.state.step == last:
+                os._exit(3)
+            return original(self, batch)
+
+        StageRun.step = dying  # type: ignore[method-assign]
+    programme(data, out)
+
+
+if __name__ == "__main__":
+    main()
