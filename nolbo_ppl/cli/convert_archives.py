@@ -17,7 +17,7 @@ from nolbo_ppl.data.converters.bop_models import model_files
 from nolbo_ppl.data.converters.coco import read_coco
 from nolbo_ppl.data.converters.pascal3d import cad_files, read_objectnet3d, read_pascal3d
 from nolbo_ppl.data.converters.pix3d import pix3d_models, read_pix3d
-from nolbo_ppl.data.converters.stanford_cars import read_stanford_cars
+from nolbo_ppl.data.converters.stanford_cars import read_car_poses, read_stanford_cars
 from nolbo_ppl.data.converters.voc import read_voc
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.io.text import read_words
@@ -177,11 +177,14 @@ class StanfordCars:
     """Folder for images/, scenes.jsonl, source.json."""
     only_present: bool = False
     """Skip images that are not there."""
+    poses: Path | None = None
+    """3D poses of the cars (`train_anno.pkl` of StanfordCars3D): viewpoints and cameras. It is read as plain data, not run."""
 
     def write(self) -> str:
         """Run it and say what was written."""
         source = {"archive": "Stanford Cars", "annotations": self.annotations.name}
-        images = read_stanford_cars(self.annotations, self.images, only_present=self.only_present)
+        poses = None if self.poses is None else read_car_poses(self.poses)
+        images = read_stanford_cars(self.annotations, self.images, only_present=self.only_present, poses=poses)
         return written(write_archive(self.out, images, source))
 
 

@@ -1,6 +1,7 @@
 """Adapters of public archives: layouts made by the tests, real annotation files where they are at hand."""
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from nolbo_ppl.cli import main
 from nolbo_ppl.data.converters.archives import ArchiveImage, ArchiveObject, pascal_rotation, scene_line, write_archive
 from nolbo_ppl.data.converters.coco import read_coco
 from nolbo_ppl.data.converters.pascal3d import cad_files, read_objectnet3d, read_pascal3d, read_pascal3d_annotation
-from nolbo_ppl.data.converters.stanford_cars import read_stanford_cars
+from nolbo_ppl.data.converters.stanford_cars import read_car_poses, read_stanford_cars
 from nolbo_ppl.data.converters.voc import read_voc, read_voc_annotation
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import InputError
@@ -257,6 +258,47 @@ def test_stanford_cars_label_one_car_and_leave_the_others_unknown(tmp_path: Path
     assert scene_line(only, "x")["exhaustive"] == []
     with pytest.raises(InputError, match=r"image of annotations\(2\): got 00002.jpg"):
         list(read_stanford_cars(tmp_path / "annos.mat", tmp_path / "cars"))
+
+
+@pytest.mark.parametrize("angles", [(0.3, 0.2, -0.1), (2.9, -0.15, 0.3), (5.4, 0.5, 0.0)])
+def test_poses_of_cars_project_as_their_authors_do(tmp_path: Path, angles: tuple[float, float, float]) -> None:
+    """Points of a car's plane of symmetry, by the authors' projection (x ahead, y up, behind a camera that looks along -z) and by
+    the library's rotation and camera."""
+    azimuth, elevation, theta = angles
+    row = {"azimuth": azimuth, "elevation": elevation, "theta": theta, "distance": 2.5, "f": 346.0, "u": 25.0, "v": -26.0}
+    (tmp_path / "anno.pkl").write_bytes(pickle.dumps({"00001.jpg": {**row, "model_id": "abc"}}, protocol=0))
+    pose = read_car_poses(tmp_path / "anno.pkl")["00001.jpg"]
+    ahead, up = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 20))
+    ca, sa, ce, se, ct, st = (f(angle) for angle in angles for f in (np.cos, np.sin))
+    Ry = np.array([[ca, 0, -sa], [0, 1, 0], [sa, 0, ca]])
+    Rx = np.array([[1, 0, 0], [0, ce, -se], [0, se, ce]])
+    Rz = np.array([[ct, -st, 0], [st, ct, 0], [0, 0, 1]])
+    theirs = np.stack([ahead, up, np.zeros(20)]).T @ (Rz @ Rx @ Ry).T - [0, 0, 2.5]
+    drawn = 346.0 * theirs[:, :2] / theirs[:, 2:] + [25.0 + 150, -26.0 + 100]  # of an image of 300 x 200
+    fx, fy, cx, cy = pose.camera(600, 400)
+    R = pascal_rotation(pose.viewpoint, [cx - 5, cy - 5, cx + 5, cy + 5], [fx, fy, cx, cy])
+    ours = np.stack([np.zeros(20), -ahead, up]).T @ R.T + [0, 0, 2.5]
+    np.testing.assert_allclose(ours[:, :2] / ours[:, 2:] * [fx, fy] + [cx, cy], 2 * drawn, atol=1e-9)
+
+
+def test_cars_take_their_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"bbox_x1": 5, "bbox_y1": 6, "bbox_x2": 50, "bbox_y2": 60, "class": 2, "fname": f"0000{k}.jpg"} for k in (1, 2)]
+    for row in rows:
+        picture(tmp_path / "cars" / row["fname"])
+    savemat(tmp_path / "annos.mat", {"annotations": rows})
+    pose = {"azimuth": 0.0, "elevation": 0.1, "theta": 0.0, "distance": 1.0, "f": 300.0, "u": 0.0, "v": 0.0, "model_id": "abc"}
+    (tmp_path / "anno.pkl").write_bytes(pickle.dumps({"00001.jpg": pose}, protocol=2))
+    arguments = ["--annotations", "annos.mat", "--images", "cars", "--poses", "anno.pkl", "--out", "out"]
+    main(["convert", "stanford-cars", *(str(tmp_path / one) if k % 2 else one for k, one in enumerate(arguments))])
+    assert "2 images, 2 objects, 1 viewpoints" in capsys.readouterr().out
+    folder = SceneFolder(tmp_path / "out")
+    np.testing.assert_allclose(folder.labels["viewpoint"][0, 0], [np.pi / 2, 0.1, 0.0], atol=1e-6)  # its nose points left
+    assert folder.labels["has_viewpoint"][:, 0].tolist() == [True, False]
+    np.testing.assert_allclose(folder.intrinsics(0), [100.0, 100.0, 50.0, 40.0])
+    for change, message in (({"f": 0.0}, "00001.jpg: f: got 0.0"), ({"theta": "x"}, "00001.jpg: theta: got x")):
+        (tmp_path / "anno.pkl").write_bytes(pickle.dumps({"00001.jpg": {**pose, **change}}))
+        with pytest.raises(InputError, match=message):
+            read_car_poses(tmp_path / "anno.pkl")
 
 
 def test_real_annotation_files(data_dir: Path, tmp_path: Path) -> None:
