@@ -69,6 +69,7 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         scene_steps=sizes.scene_steps,
         batch=sizes.batch,
         shape_batch=min(32, sizes.batch),
+        shape_decode=8,
         evaluate_every=10**6,
         evaluate_scenes=64,
         checkpoint_every=20,

@@ -38,7 +38,7 @@ FREE_FIELDS = (
     "prefetch",
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
-NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False, "joint": 0.25}
+NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False, "joint": 0.25, "shape_decode": 0}
 """Fields that a checkpoint need not name where they have these values, for the same reason as `OPTIONAL_FIELDS`."""
 OPTIONAL_FIELDS = (
     "categories",
@@ -152,6 +152,8 @@ class TrainConfig:
     """Scenes a step, over all processes."""
     shape_batch: int = 32
     """Shapes a step."""
+    shape_decode: int = 0
+    """Shapes decoded a step, which stand for all: the decoder costs four times what the 3D encoder does. 0 for all."""
     learning_rate: float = 2.5e-3
     """Rate of the stages on images after their warm-up."""
     optimizer: Literal["muon", "adamw"] = "muon"
@@ -247,6 +249,7 @@ class TrainConfig:
             "scene_steps",
             "single_count",
             "decode",
+            "shape_decode",
             "threads",
             "evaluate_scenes",
             "seed",
@@ -352,6 +355,7 @@ class TrainConfig:
                 "shapes",
                 OptimizerConfig(self.shape_steps, 2e-3, warmup=min(50, self.shape_steps), clip=5000.0, ema=0.99),
                 shape_weights(self.method),
+                decode=self.shape_decode,
             ),
             TrainingStage(
                 "single",
