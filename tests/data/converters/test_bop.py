@@ -17,6 +17,7 @@ from nolbo_ppl.data.converters.bop import read_bop, read_targets, splits
 from nolbo_ppl.data.converters.bop_models import YCB_VIDEO, read_models
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.data.format_registry import check_data
+from nolbo_ppl.data.known_formats import stated_categories
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.io.trajectories import read_trajectory
@@ -134,6 +135,7 @@ def test_the_command_writes_scenes_with_shapes_and_paths(tmp_path: Path, capsys:
     assert path.times is not None and path.times.tolist() == [1.0, 2.0, 3.0]
     assert json.loads((tmp_path / "out" / "source.json").read_text())["categories"] == [YCB_VIDEO[1]]
     main(arguments)  # what was converted before is replaced
+    assert stated_categories(tmp_path / "out") == (YCB_VIDEO[1],)
     report = check_data(tmp_path / "out")
     assert report.format == "scenes" and report.facts["categories"] == {YCB_VIDEO[1]: 3} and not report.problems
 
@@ -165,11 +167,11 @@ MALFORMED = [
     (SCENE + "scene_gt.json", lambda c: c.update(first=[]), r"number of an image: got first"),
     (SCENE + "scene_gt.json", lambda c: c["2"].append(c["2"][0]), r"scene_gt_info\.json: image 2: got 1, expected 2 objects"),
     (SCENE + "scene_gt_info.json", lambda c: c["1"][0].update(visib_fract=2), r"1\[0\]\.visib_fract: got 2"),
-    (SCENE + "scene_gt_info.json", lambda c: c["1"][0].pop("bbox_obj") and None, r"1\[0\]\.bbox_obj: got None"),
+    (SCENE + "scene_gt_info.json", lambda c: c["1"][0].pop("bbox_obj") and None, r"1\[0\]\.bbox_obj: expected 4"),
     (SCENE + "scene_camera.json", lambda c: c["1"].update(depth_scale=-1), r"1\.depth_scale: got -1"),
     (SCENE + "scene_camera.json", lambda c: c["1"].update(cam_K=[0] * 9), r"1\.cam_K"),
-    (SCENE + "scene_camera.json", lambda c: c["3"].pop("cam_t_w2c") and None, r"3\.cam_t_w2c: got None"),
-    (SCENE + "scene_camera.json", lambda c: c.pop("3") and None, r"camera of image 3: got None"),
+    (SCENE + "scene_camera.json", lambda c: c["3"].pop("cam_t_w2c") and None, r"3\.cam_t_w2c: expected 3"),
+    (SCENE + "scene_camera.json", lambda c: c.pop("3") and None, r"camera of image 3: expected"),
     ("models/models_info.json", lambda c: c["1"].update(size_x=0), r"models_info\.json: 1\.size"),
     ("models/models_info.json", lambda c: c["1"].update(min_y="low"), r"1\.min_y: got low"),
     ("models/models_info.json", lambda c: c["2"].update(symmetries_discrete=[[0] * 16]), r"2\.symmetries_discrete\[0\]"),
