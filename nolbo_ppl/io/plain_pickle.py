@@ -57,7 +57,7 @@ def read_plain_pickle(path: str | os.PathLike[str]) -> Any:
             raise input_error("a pickle", got=f"{path.stat().st_size} bytes", expected=f"at most {LARGEST}", file=path)
         data = path.read_bytes()
     stack: list[Any] = []
-    memory: dict[int, Any] = {}
+    memory: dict[Any, Any] = {}
 
     def taken(count: int) -> list[Any]:
         values = [stack.pop() for _ in range(count)][::-1]

@@ -218,7 +218,7 @@ def _annotations(
         raise input_error(f"image {key}", got=got, expected=f"{len(rows)} objects, as in {GROUND_TRUTH}", file=about_file)
     width, height = image_size(path)
     limit = np.array([width, height, width, height], dtype=np.float64)
-    found: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    found: dict[str, Any] = {name: [] for name in COLUMNS}
     ignore = []
     for place, (row, info) in enumerate(zip(rows, about)):
         where = f"{key}[{place}]."
