@@ -48,3 +48,7 @@ class IncrementalMemory:
         new_rate, clutter_rate = self.config.new_rate, self.config.clutter_rate
         assert new_rate is not None and clutter_rate is not None  # the calibration states both
         return Tracker(self.config, len(self.prior.mean), self.prior, new_rate, clutter_rate)
+
+    def live_landmarks(self) -> set[int]:
+        """Landmarks that belong to tracks the tracker still follows."""
+        return {self.loops.map.standing(track.landmark) for track in self.tracks.values() if track.landmark >= 0}

@@ -18,17 +18,17 @@ from jaxtyping import Float
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.geometry.pose import inverse, is_rotation, make_pose, transform
+from nolbo_ppl.geometry.pose import inverse, is_rotation
 from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.incremental.forgetting import forget_oldest
 from nolbo_ppl.inference.slam.incremental.incremental_calibration import calibrate_incremental, default_calibration
-from nolbo_ppl.inference.slam.incremental.incremental_loops import SURE_WEIGHT, LoopCloser
+from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser
 from nolbo_ppl.inference.slam.incremental.incremental_memory import IncrementalMemory
 from nolbo_ppl.inference.slam.incremental.incremental_state import load_state, save_state
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig
-from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
+from nolbo_ppl.inference.slam.incremental.landmark_assignment import assign_landmarks
 from nolbo_ppl.inference.slam.incremental.map_answers import map_landmarks
-from nolbo_ppl.inference.slam.incremental.running_map import RunningMap, count_detections, new_landmark
+from nolbo_ppl.inference.slam.incremental.running_map import RunningMap
 from nolbo_ppl.inference.slam.initialise import init_from_tracklets
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_ROTATION_STEP, DEFAULT_TRANSLATION_RATIO, estimate_noise
@@ -45,11 +45,6 @@ from nolbo_ppl.inference.slam.tracking import summarise_tracks
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.landmark import Landmark
-
-MOST_WAIT = 5
-"""Detections a track gathers at most before it founds a landmark, where a known one may be there but is not sure."""
-LATELY = 50
-"""A detector that gave no orientation in so many frames gives none."""
 
 
 @dataclass(frozen=True)
@@ -141,17 +136,13 @@ class IncrementalSlam(IncrementalMemory):
             self.weights.append(weight)
         if table.has_rotation.any():
             self.last_oriented = frame
-        met = self._map(table, measurements, noise, assigned, frame)
+        met = assign_landmarks(self, table, measurements, noise, assigned, frame)
         self.keeper.advance(frame, self.graph)
         self.graph.commit()
-        closings = self.loops.close(frame, self.graph, noise, self._live())
+        closings = self.loops.close(frame, self.graph, noise, self.live_landmarks())
         self.T_world_camera = self.graph.pose(frame)
-        forget_oldest(self.graph, self.loops, self.keeper, frame, self._live())
+        forget_oldest(self.graph, self.loops, self.keeper, frame, self.live_landmarks())
         return IncrementalInfo(frame, self.T_world_camera, len(self.loops.map), closings, met, len(self.graph.of_pose))
-
-    def _live(self) -> set[int]:
-        """Landmarks that belong to live tracks."""
-        return {self.loops.map.standing(t.landmark) for t in self.tracks.values() if t.landmark >= 0}
 
     def _begin(self, first: SlamProblem) -> None:
         """At the first keyframe: scales of the reference, and the prior of features."""
@@ -223,96 +214,6 @@ class IncrementalSlam(IncrementalMemory):
         if not len(measurements):
             return np.zeros(0, dtype=np.int64), np.zeros(0)
         return tracker.associate(measurements.in_world(np.tile(odometry, (len(measurements), 1, 1))), frame)
-
-    def _map(self, table: Detections, measurements: Measurements, noise: NoiseModel, assigned: np.ndarray, frame: int) -> int:
-        """Put this keyframe's detections to landmarks; returns how many tracks met an old one.
-
-        A track asks for its landmark with its second detection (`track_minimum`), or later where it is not sure.
-        """
-        asking: list[tuple[int, int]] = []
-        for i, number in enumerate(assigned.tolist()):
-            if number < 0:
-                continue
-            if number not in self.tracks:
-                draft = new_landmark(-1, self.loops.drift.place, frame, self.prior, int(measurements.symmetry[i]))
-                self.tracks[number] = LiveTrack(-1, draft)
-            track = self.tracks[number]
-            track.last = frame
-            if track.landmark < 0:
-                track.draft.add(frame, measurements, i, table.size[i])
-                track.waiting.append((frame, measurements.select(np.array([i]))))
-                if len(track.waiting) >= self.config.track_minimum:
-                    asking.append((number, i))
-        met = self._ask(asking, table, noise, frame)
-        rows, landmarks = [], []
-        for i, number in enumerate(assigned.tolist()):
-            if number < 0 or self.tracks[number].landmark < 0:
-                continue
-            track = self.tracks[number]
-            track.landmark = self.loops.map.standing(track.landmark)
-            for earlier, measurement in track.waiting[:-1]:
-                if earlier in self.graph.of_pose:  # else it has left the window
-                    self._observe(measurement, noise, [0], earlier, self.graph.pose(earlier), [track.landmark])
-            if not track.waiting:
-                self.loops.map.landmarks[track.landmark].add(frame, measurements, i, table.size[i])
-            track.waiting = []
-            rows.append(i)
-            landmarks.append(track.landmark)
-        self._observe(measurements, noise, rows, frame, self.T_world_camera, landmarks)
-        self.keeper.saw(frame, [self.loops.map.landmarks[j].passes > 1 for j in landmarks])
-        for number in [n for n, track in self.tracks.items() if frame - track.last > self.config.track_gap]:
-            del self.tracks[number]
-        return met
-
-    def _observe(
-        self,
-        measurements: Measurements,
-        noise: NoiseModel,
-        rows: list[int],
-        frame: int,
-        T_world_camera: Float[np.ndarray, "4 4"],
-        landmarks: list[int],
-    ) -> None:
-        """Factors of detections of one keyframe, and their evidence that there are objects (see `map_answers`)."""
-        if not rows:
-            return
-        T = self.graph.observe(measurements, noise, self.config, rows, frame, T_world_camera, landmarks)
-        error = transform(inverse(T_world_camera), T[:, :3, 3]) - measurements.position[rows]
-        count_detections(
-            [self.loops.map.landmarks[j] for j in landmarks],
-            error,
-            T_world_camera[:3, :3],
-            measurements.covariance[rows],
-            (measurements.log_object - measurements.log_clutter)[rows],
-            noise,
-        )
-
-    def _ask(self, asking: list[tuple[int, int]], table: Detections, noise: NoiseModel, frame: int) -> int:
-        """Give tracks their landmarks: one met again where that is sure, else a new one; the unsure may wait."""
-        if not asking:
-            return 0
-        tracks = [self.tracks[number] for number, _ in asking]
-        poses = [self._pose_of(table, i) for _, i in asking]
-        found, new = self.loops.meet([t.draft for t in tracks], poses, frame, self._live(), self.graph, noise)
-        met, oriented = 0, self.last_oriented is not None and frame - self.last_oriented < LATELY
-        for track, T, (landmark, weight), alone, (_, i) in zip(tracks, poses, found, new, asking):
-            if weight > SURE_WEIGHT:
-                old = self.loops.map.landmarks[landmark]
-                track.landmark = landmark
-                old.absorb(track.draft)
-                self.loops.met(landmark, T[:3, 3], noise)
-                met += 1
-            elif alone > SURE_WEIGHT or len(track.waiting) >= MOST_WAIT:
-                number = self.graph.add_landmark(T, float(np.linalg.norm(table.position[i])), oriented)
-                track.landmark = track.draft.number = number
-                track.draft.place = self.loops.drift.place
-                self.loops.add(track.draft, T[:3, 3])
-        return met
-
-    def _pose_of(self, table: Detections, i: int) -> Float[np.ndarray, "4 4"]:
-        """First value of a landmark: its latest detection."""
-        R = self.T_world_camera[:3, :3] @ table.rotation[i] if table.has_rotation[i] else np.eye(3)
-        return make_pose(R, transform(self.T_world_camera, table.position[i]))
 
     # -- answers ------------------------------------------------------------------------------------------------------
 
