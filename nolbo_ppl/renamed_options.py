@@ -11,11 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from types import UnionType
 from typing import Any, TypeVar
 
+from nolbo_ppl.errors import InputError, input_error
+
 T = TypeVar("T")
 
 
 def renamed_options(**names: str) -> Callable[[type[T]], type[T]]:
     """Let a dataclass of options take and show old names of its fields (`old="new"`), with a `FutureWarning`.
+
+    Both names at once are an error (`InputError`). `dataclasses.replace` takes old names too: it hands every field over by its
+    name, so that a call which names them all and an old one besides is taken for a replacement.
 
     Example:
         >>> @renamed_options(wheel="step_lengths")
@@ -32,10 +37,15 @@ def renamed_options(**names: str) -> Callable[[type[T]], type[T]]:
 
     def of(config: type[T]) -> type[T]:
         made = config.__init__
+        options = [option.name for option in dataclasses.fields(config) if option.init]  # type: ignore[arg-type]
 
         @functools.wraps(made)
         def init(self: Any, *args: Any, **given: Any) -> None:
-            for old in names.keys() & given.keys():
+            replacement = given.keys() >= set(options)
+            stated = given.keys() | set(options[: len(args)])
+            for old in [name for name in names if name in given]:
+                if names[old] in stated and not replacement:
+                    raise _twice(config.__name__, old, names[old])
                 _warn(config.__name__, old, names[old])
                 given[names[old]] = given.pop(old)
             made(self, *args, **given)
@@ -63,15 +73,22 @@ def current_arguments(config: Any, args: Sequence[str] | None, prefix: str = "")
         config: the dataclass of the command.
         args: what was given; None: the command line of the process.
         prefix: of the options of a nested dataclass, `slam.`.
+
+    Raises:
+        InputError: an option is given by both of its names.
     """
     found = list(sys.argv[1:] if args is None else args)
+    given = {text.partition("=")[0].replace("_", "-") for text in found}
     for old, new in getattr(config, _MARK, {}).items():
+        former, current = ([f"{sign}{prefix}{name}".replace("_", "-") for sign in ("--", "--no-")] for name in (old, new))
+        if given.intersection(former) and given.intersection(current):
+            raise _twice("options", former[0], current[0])
         for i, text in enumerate(found):
             option, equals, value = text.partition("=")
-            for sign in ("--", "--no-"):
-                if option.replace("_", "-") == f"{sign}{prefix}{old}".replace("_", "-"):
-                    _warn("options", option, current := f"{sign}{prefix}{new}".replace("_", "-"))
-                    found[i] = current + equals + value
+            if option.replace("_", "-") in former:
+                name = current[former.index(option.replace("_", "-"))]
+                _warn("options", option, name)
+                found[i] = name + equals + value
     for name, nested in _nested(config).items():
         found = current_arguments(nested, found, f"{prefix}{name}.")
     return found
@@ -84,6 +101,24 @@ def stored_names(config: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     return {
         old.get(name, name): stored_names(nested[name], value) if name in nested and isinstance(value, Mapping) else value
         for name, value in values.items()
+    }
+
+
+def current_names(config: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a dataclass from a file under their present names: the inverse of `stored_names`, without a warning.
+
+    Raises:
+        InputError: a value stands there by both of its names.
+    """
+    new = getattr(config, _MARK, {})
+    both = next((old for old in values if old in new and new[old] in values), None)
+    if both is not None:
+        raise _twice("stored options", both, new[both])
+    nested = _nested(config)
+    found = {new.get(name, name): value for name, value in values.items()}
+    return {
+        name: current_names(nested[name], value) if name in nested and isinstance(value, Mapping) else value
+        for name, value in found.items()
     }
 
 
@@ -105,3 +140,11 @@ def _nested(config: Any) -> dict[str, Any]:
 
 def _warn(where: str, old: str, new: str) -> None:
     warnings.warn(f"{where}: `{old}` is now `{new}`; the old name goes with 0.3.0", FutureWarning, stacklevel=3)
+
+
+def _twice(where: str, old: str, new: str) -> InputError:
+    return input_error(
+        f"{where}: `{old}` and `{new}` are one option",
+        expected="one of its two names",
+        do=f"give `{new}`; the old name goes with 0.3.0",
+    )

@@ -23,6 +23,7 @@ from nolbo_ppl.io.observations import read_observations
 from nolbo_ppl.io.output_folder import output_folder
 from nolbo_ppl.io.trajectories import Trajectory, covariance_beside, read_frame_poses, read_trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import trajectory_errors
+from nolbo_ppl.renamed_options import current_arguments
 
 SESSIONS = "sessions.json"
 """What is said of each drive and of each pair of drives."""
@@ -142,7 +143,7 @@ def run(config: MergeConfig) -> tuple[SessionsResult, dict[str, Any]]:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Command line of `nolbo merge`."""
-    config = tyro.cli(MergeConfig, prog="nolbo merge", args=args, description=__doc__)
+    config = tyro.cli(MergeConfig, prog="nolbo merge", args=current_arguments(MergeConfig, args), description=__doc__)
     found, report = run(config)
     lines = []
     for number, joint in enumerate(found.maps):

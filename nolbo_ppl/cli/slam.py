@@ -22,6 +22,7 @@ from nolbo_ppl.io.trajectories import TIME_TOLERANCE, Trajectory, read_covarianc
 from nolbo_ppl.io.trajectory_tables import TableFormat
 from nolbo_ppl.io.true_objects import read_true_objects
 from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.renamed_options import current_arguments
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ def describe(report: dict[str, object]) -> str:
 
 def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo slam`."""
-    arguments = tyro.cli(SlamRunConfig, prog="nolbo slam", args=args)
+    arguments = tyro.cli(SlamRunConfig, prog="nolbo slam", args=current_arguments(SlamRunConfig, args))
     _, report = run(arguments)
     sys.stdout.write(describe(report) + f"\nwritten to {arguments.out}\n")
 

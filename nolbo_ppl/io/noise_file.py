@@ -12,11 +12,15 @@ from nolbo_ppl.structures.noise_model import NoiseModel
 
 TEXTS = ("report", "warnings")
 """What `slam/summary.json` tells already."""
+STORED = {"birth_intensity": "new_rate", "clutter_intensity": "clutter_rate"}
+"""Names in the file that are not those of the fields: the ones that files of 0.1.0 have."""
 
 
 def write_noise(path: Path, noise: NoiseModel) -> None:
     """Write the numbers of a noise model as one NPZ file (`noise.npz` of a run), atomically."""
-    values = {field.name: getattr(noise, field.name) for field in fields(noise) if field.name not in TEXTS}
+    values = {
+        STORED.get(field.name, field.name): getattr(noise, field.name) for field in fields(noise) if field.name not in TEXTS
+    }
     save_npz(path, {name: value for name, value in values.items() if value is not None})
 
 
@@ -28,7 +32,8 @@ def read_noise(path: Path) -> NoiseModel:
     """
     with Npz(path) as archive:
         arrays = {name: archive.array(name) for name in archive.names}
-    values: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in arrays.items()}
+    field_of = {stored: name for name, stored in STORED.items()}
+    values: dict[str, Any] = {field_of.get(k, k): value if value.ndim else float(value) for k, value in arrays.items()}
     try:
         return NoiseModel(**values, report={}, warnings=())
     except TypeError as error:

@@ -22,9 +22,9 @@ class NoiseModel:
     """Standard deviation of every observed angle, rad."""
     latent_scale: Float[np.ndarray, "k d"]
     """Standard deviation of every latent coordinate."""
-    new_rate: float
+    birth_intensity: float
     """Landmarks not seen before, per m^3."""
-    clutter_rate: float
+    clutter_intensity: float
     """False detections, per m^3 and frame."""
     report: dict[str, float]
     """Estimated values by name."""

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from nolbo_ppl.errors import InputError
+from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.pipeline.run_config import RunConfig
 from nolbo_ppl.pipeline.stage_keys import stage_settings
-from nolbo_ppl.renamed_options import current_arguments, renamed_options, stored_names
+from nolbo_ppl.renamed_options import current_arguments, current_names, renamed_options, stored_names
 
 OPTIONS = {
     "cli.curves:CurvesConfig": """
@@ -104,10 +106,23 @@ def test_a_run_takes_old_names_and_keeps_them_in_its_files(tmp_path: Path) -> No
     assert "loop_gap" in settings["figures"] and not {"test_sizes", "min_loop_gap"} & set().union(*settings.values())
 
 
+def test_settings_of_slam_keep_their_old_names_in_files(tmp_path: Path) -> None:
+    """The key of the stage of SLAM is that of 0.1.0, so that a map that is done stays done."""
+    with pytest.warns(FutureWarning, match="SlamConfig: `new_rate` is now `birth_intensity`"):
+        config = SlamConfig(new_rate=0.3, clique_window=9)  # type: ignore[call-arg]
+    assert config.birth_intensity == 0.3
+    settings = stage_settings(RunConfig(images=tmp_path, out=tmp_path / "out", slam=config), lambda: 1)["slam"]["slam"]
+    assert settings["new_rate"] == 0.3 and settings["constellation_size"] == 9 and settings["clutter_rate"] is None
+    assert not {"birth_intensity", "clique_window", "equality_minimum"} & settings.keys()
+    with pytest.warns(FutureWarning, match=r"--slam\.constellation-rounds` is now `--slam\.clique-rounds"):
+        assert current_arguments(RunConfig, ["--slam.constellation-rounds", "2"]) == ["--slam.clique-rounds", "2"]
+
+
 @renamed_options(gap="min_gap")
 @dataclasses.dataclass(frozen=True)
 class Inner:
     min_gap: int = 1
+    width: float = 2.0
 
 
 @renamed_options(draw="pictures")
@@ -120,13 +135,27 @@ class Outer:
 
 def test_nested_options_and_switches() -> None:
     with pytest.warns(FutureWarning):
-        found = current_arguments(Outer, ["--no-draw", "--inner.gap=4", "--other.gap", "5", "--inner.min-gap", "6", "gap"])
-    assert found == ["--no-pictures", "--inner.min-gap=4", "--other.min-gap", "5", "--inner.min-gap", "6", "gap"]
+        found = current_arguments(Outer, ["--no-draw", "--inner.gap=4", "--other.gap", "5", "gap"])
+    assert found == ["--no-pictures", "--inner.min-gap=4", "--other.min-gap", "5", "gap"]
+    stored = {"draw": True, "inner": {"gap": 3, "width": 2.0}, "other": None}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert current_arguments(Outer, found) == found
-        assert stored_names(Outer(), dataclasses.asdict(Outer(inner=Inner(3)))) == {
-            "draw": True,
-            "inner": {"gap": 3},
-            "other": None,
-        }
+        present = dataclasses.asdict(Outer(inner=Inner(3)))
+        assert stored_names(Outer(), present) == stored
+        assert current_names(Outer, stored) == present == current_names(Outer, present)
+
+
+def test_an_option_by_both_of_its_names_is_refused() -> None:
+    for args, given in (((), {"gap": 1, "min_gap": 2}), ((2,), {"gap": 1})):
+        with pytest.raises(InputError, match="Inner: `gap` and `min_gap` are one option"):
+            Inner(*args, **given)
+    for line in (["--inner.min-gap", "6", "--inner.gap=4"], ["--inner.gap", "4", "--inner.min_gap=6"]):
+        with pytest.raises(InputError, match=r"`--inner\.gap` and `--inner\.min-gap` are one option"):
+            current_arguments(Outer, line)
+    with pytest.raises(InputError, match="`--draw` and `--pictures` are one option"):
+        current_arguments(Outer, ["--no-draw", "--pictures"])
+    with pytest.raises(InputError, match="`gap` and `min_gap` are one option"):
+        current_names(Outer, {"inner": {"gap": 1, "min_gap": 1}})
+    with pytest.warns(FutureWarning):  # all fields of the old value are given then, and none of them by the caller
+        assert dataclasses.replace(Inner(1, 3.0), gap=5) == Inner(5, 3.0)  # type: ignore[call-arg]

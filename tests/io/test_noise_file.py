@@ -22,8 +22,8 @@ def test_noise_comes_back(tmp_path: Path, stated: bool) -> None:
         position_covariance=rng.random((7, 3, 3)),
         rotation_scale=rng.random(7),
         latent_scale=rng.random((7, 5)),
-        new_rate=0.1,
-        clutter_rate=1e-3,
+        birth_intensity=0.1,
+        clutter_intensity=1e-3,
         report={"position_lateral": 0.3},
         warnings=("too small",),
         position_factor=1.7,
@@ -32,6 +32,8 @@ def test_noise_comes_back(tmp_path: Path, stated: bool) -> None:
         step_correlation=rng.random((4, 6, 6)) if stated else None,
     )
     write_noise(tmp_path / "noise.npz", noise)
+    with np.load(tmp_path / "noise.npz") as file:  # names that folders of 0.1.0 have
+        assert file["new_rate"] == 0.1 and file["clutter_rate"] == 1e-3 and "birth_intensity" not in file
     back = read_noise(tmp_path / "noise.npz")
     for field in fields(noise):
         if field.name not in TEXTS:

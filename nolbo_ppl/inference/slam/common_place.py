@@ -224,7 +224,7 @@ def find_common_place(
         first: map whose world the answer is in.
         second: the other one.
         log_feature: log ratio of latent and category of each pair being one object to being two, nats.
-        config: `constellation_log_odds` has to be reached, half of it as the margin over any other relative pose.
+        config: `clique_log_odds` has to be reached, half of it as the margin over any other relative pose.
         floor: standard deviation of one object's mapped position from visit to visit, m.
     """
     i, j = np.nonzero(log_feature > FEATURE_MINIMUM)
@@ -254,7 +254,7 @@ def find_common_place(
     log_odds, a, b, fit = found[0]
     rivals = [value for value, _, _, other in found[1:] if not _same_motion(fit, other, second, floor)]
     margin = log_odds - max([0.0, *rivals])
-    if log_odds < config.constellation_log_odds or margin < config.constellation_log_odds / 2:
+    if log_odds < config.clique_log_odds or margin < config.clique_log_odds / 2:
         return None
     return CommonPlace(fit.T_a_b, fit.covariance, a, b, log_odds, margin)
 

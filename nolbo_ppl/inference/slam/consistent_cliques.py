@@ -120,7 +120,7 @@ def find_loop_closure(
     log_new: float,
 ) -> LoopClosure | None:
     """The best clique of one window's pairs, or None when it is too small, too weak or not unique."""
-    if len(pairs) < config.constellation_minimum:
+    if len(pairs) < config.clique_minimum:
         return None
     pairs = pairs.select(np.flatnonzero(pairs.log_feature > FEATURE_MINIMUM))
     if len(pairs) > NODE_BUDGET:
@@ -130,14 +130,14 @@ def find_loop_closure(
     deviation = samples.position[pairs.a] - samples.position[pairs.b]
     # Annealing widens what all pairs share (drift); what tells them apart is local and well known.
     together = consistency(gap, deviation, pairs, min(inflation, 2.0), floor)
-    nodes = promising_nodes(together, config.constellation_minimum)
-    if len(nodes) < config.constellation_minimum:
+    nodes = promising_nodes(together, config.clique_minimum)
+    if len(nodes) < config.clique_minimum:
         return None
     graph = networkx.Graph()
     graph.add_edges_from(np.argwhere(np.triu(together[np.ix_(nodes, nodes)], 1)).tolist())
     cliques = []
     for clique in islice(networkx.find_cliques(graph), CLIQUE_BUDGET):
-        if len(clique) >= config.constellation_minimum:
+        if len(clique) >= config.clique_minimum:
             members = nodes[np.array(clique)]
             cliques.append((float(len(members) * 3.0 + pairs.log_feature[members].sum()), members))
     if not cliques:
@@ -186,7 +186,7 @@ def close_constellations(
     found = []
     order = np.argsort(pairs.a, kind="stable")
     sorted_a = pairs.a[order]
-    for window in windows(first, config.constellation_size):
+    for window in windows(first, config.clique_window):
         member = np.sort(window)
         low, high = np.searchsorted(sorted_a, member, "left"), np.searchsorted(sorted_a, member, "right")
         rows = np.concatenate([order[s:e] for s, e in zip(low, high)]) if len(member) else np.zeros(0, int)
@@ -195,7 +195,7 @@ def close_constellations(
         closing = find_loop_closure(
             pairs.select(rows), estimate, samples, config, inflation=inflation, floor=floor, log_new=log_new
         )
-        if closing and closing.log_odds > config.constellation_log_odds and closing.margin > config.constellation_log_odds / 2:
+        if closing and closing.log_odds > config.clique_log_odds and closing.margin > config.clique_log_odds / 2:
             found.append(closing)
     found.sort(key=lambda closing: -closing.log_odds)
     partner: dict[int, int] = {}

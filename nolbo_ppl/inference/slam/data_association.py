@@ -89,7 +89,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         log_once = model.log_pattern(np.ones(n), np.maximum(count, 1.0), chance) - np.log(chance)
         log_once[moving] = 0.0  # it was elsewhere
         log_new = score + log_once + np.log(model.unmapped)
-        log_new += np.log(model.new_rate) if model.new_rate is not None else model.log_objects(seen, log_density)
+        log_new += np.log(model.birth_intensity) if model.birth_intensity is not None else model.log_objects(seen, log_density)
         log_null = np.logaddexp(log_new, log_clutter)
         log_odds_without = log_odds[pairs.landmark] - contribution(state, pairs, weight, model, of_landmark, log_density)
         log_detected = detected_log_odds(state, pairs, weight, model, of_landmark, log_odds_without)

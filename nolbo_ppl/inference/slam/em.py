@@ -123,7 +123,7 @@ def soft_assignment(
     a, b = pairs.a[best], pairs.b[best]
     log_null = np.full(len(group), log_new)
     found = frame_marginals(group, a, candidate[best], value[best], log_null, associator=config.associator)
-    strong = found.weight > config.link_minimum
+    strong = found.weight > config.equality_minimum
     evidence = float(found.log_evidence.sum() - log_null.sum())
     return a[strong], b[strong], np.minimum(found.weight[strong], 1.0), evidence
 
@@ -193,7 +193,7 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
         news = len(closed) - len(state.closed)
         # A few more can wait for the soft E-step; the first rounds must anneal.
         few = news <= 0.02 * len(closed) and state.iteration + 1 >= len(config.annealing)
-        last_round = not closed or few or state.iteration + 1 >= config.constellation_rounds
+        last_round = not closed or few or state.iteration + 1 >= config.clique_rounds
         state = replace(state, closed=closed, closing=not last_round)
     else:
         links, evidence = soft_landmark_equalities(state, pairs)

@@ -71,10 +71,10 @@ class FrameModel:
     """Its constant part."""
     score_correlation: float = 0.0
     """Correlation of the scores of one object: looks of one network are alike."""
-    clutter_rate: float | None = None
-    """Stated clutter density, per m^3 and frame."""
-    new_rate: float | None = None
-    """Stated density of objects not in the map, per m^3."""
+    clutter_intensity: float | None = None
+    """Stated clutter intensity, per m^3 and frame."""
+    birth_intensity: float | None = None
+    """Stated intensity of objects not in the map, per m^3."""
 
     def log_detection_density(self, position: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Log of the expected number of detections per m^3 and frame at positions in the camera frame."""
@@ -128,8 +128,8 @@ class FrameModel:
             measurements: in camera frames.
             log_density: `log_detection_density` of their positions. It is the costly part, and no M-step changes it.
         """
-        if self.clutter_rate is not None:
-            return np.full(len(measurements), np.log(self.clutter_rate))
+        if self.clutter_intensity is not None:
+            return np.full(len(measurements), np.log(self.clutter_intensity))
         return np.log(self.clutter_share.ravel()[self.nearest_cell(measurements.position)]) + log_density
 
     def log_objects(self, measurements: Measurements, log_density: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -220,8 +220,8 @@ def initial_frame_model(measurements: Measurements, config: SlamConfig, frames: 
         clutter_share=np.full((RANGES, AZIMUTHS), np.clip(false, 0.01, 0.9)),
         detection_probability=np.full((RANGES, AZIMUTHS), 0.7),
         stated_share=float(np.clip(false, 0.01, 0.9)),
-        clutter_rate=config.clutter_rate,
-        new_rate=config.new_rate,
+        clutter_intensity=config.clutter_intensity,
+        birth_intensity=config.birth_intensity,
     )
 
 

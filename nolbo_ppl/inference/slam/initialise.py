@@ -88,7 +88,7 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     T_camera_world = inverse(state.estimate.T_world_camera[seen.frame])
     error = transform(T_camera_world, state.estimate.T_world_landmark[state.landmark, :3, 3]) - seen.position
     log_object = seen.log_object + position_log_density(*squared_distance(error, seen.covariance), state.noise.position_dof)
-    log_background = seen.log_clutter + np.log(state.noise.clutter_rate)
+    log_background = seen.log_clutter + np.log(state.noise.clutter_intensity)
     return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
 
 

@@ -38,7 +38,7 @@ def map_log_evidence(state: SlamState) -> float:
         value -= max(steps - 1, 0) * float(np.log(state.noise.scale_walk))
     oriented = state.features.oriented
     value += -0.5 * _log_determinant(linearisation, oriented) + 1.5 * (len(oriented) + oriented.sum()) * LOG_2PI
-    value += len(oriented) * np.log(state.noise.new_rate) + oriented.sum() * UNIFORM_LOG_DENSITY
+    value += len(oriented) * np.log(state.noise.birth_intensity) + oriented.sum() * UNIFORM_LOG_DENSITY
     return float(value + np.sum(detection_log_odds(state)) + feature_log_evidence(state))
 
 
@@ -70,7 +70,7 @@ def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
         modes, symmetry = seen.modes.select(oriented), seen.symmetry[oriented]
         turn = mixture_log_density(T[oriented, :3, :3], modes, symmetry, state.config) - UNIFORM_LOG_DENSITY
         log_density[oriented] += turn / noise.rotation_factor
-    log_background = seen.log_clutter + np.log(noise.clutter_rate)
+    log_background = seen.log_clutter + np.log(noise.clutter_intensity)
     return state.weight * (np.logaddexp(seen.log_object + log_density, log_background) - log_background)
 
 

@@ -221,7 +221,7 @@ def e_step(state: ReferenceEmState) -> tuple[Float[np.ndarray, "g m"], Float[np.
         latent, variance = seen.latent[known], seen.latent_variance[known]
         population = latent_log_density(latent, state.prior.mean, variance + state.prior.variance)
         log_likelihood[known] += latent_log_density(latent[:, None], state.latent[None], variance[:, None]) - population[:, None]
-    log_null = np.logaddexp(seen.log_object + np.log(noise.new_rate), seen.log_clutter + np.log(noise.clutter_rate))
+    log_null = np.logaddexp(seen.log_object + np.log(noise.birth_intensity), seen.log_clutter + np.log(noise.clutter_intensity))
     k, j = np.nonzero(np.isfinite(log_likelihood))
     found = frame_marginals(seen.frame, k, j, log_likelihood[k, j], log_null, associator=config.associator)
     weights = np.zeros((n, m))

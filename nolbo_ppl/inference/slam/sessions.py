@@ -126,8 +126,8 @@ def joined_noise(noises: Sequence[NoiseModel], sizes: Sequence[float]) -> NoiseM
         position_covariance=np.concatenate([x.position_covariance for x in noises]),
         rotation_scale=np.concatenate([x.rotation_scale for x in noises]),
         latent_scale=_stacked([x.latent_scale for x in noises]),
-        new_rate=float(np.exp(mean([np.log(x.new_rate) for x in noises]))),
-        clutter_rate=float(np.exp(mean([np.log(x.clutter_rate) for x in noises]))),
+        birth_intensity=float(np.exp(mean([np.log(x.birth_intensity) for x in noises]))),
+        clutter_intensity=float(np.exp(mean([np.log(x.clutter_intensity) for x in noises]))),
         report={name: mean([x.report[name] for x in noises]) for name in sorted(names)},
         warnings=tuple(dict.fromkeys(f"session {k}: {text}" for k, x in enumerate(noises) for text in x.warnings)),
         position_factor=mean([x.position_factor for x in noises]),
@@ -307,7 +307,7 @@ def solve_sessions(problems: Sequence[SlamProblem], config: SlamConfig | None = 
 
     Args:
         problems: the drives; where their worlds lie to each other need not be known.
-        config: settings of every solve; `constellation_log_odds` is what a common place must reach.
+        config: settings of every solve; `clique_log_odds` is what a common place must reach.
 
     Raises:
         InputError: no problem, a malformed one, or a configuration with `scale_drift`.

@@ -13,6 +13,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation
 from nolbo_ppl.inference.association.marginals import Associator
 from nolbo_ppl.io.observations import Detections, check_table
+from nolbo_ppl.renamed_options import renamed_options
 from nolbo_ppl.structures.noise_model import NoiseModel as NoiseModel
 
 _LIMITS: dict[str, tuple[float, float, bool]] = {
@@ -24,8 +25,8 @@ _LIMITS: dict[str, tuple[float, float, bool]] = {
     "rotation_scale": (1e-9, 10.0, False),
     "latent_scale": (1e-12, 1e12, False),
     "latent_correlation": (0.0, 1.0, False),
-    "new_rate": (1e-30, 1e12, False),
-    "clutter_rate": (1e-30, 1e12, False),
+    "birth_intensity": (1e-30, 1e12, False),
+    "clutter_intensity": (1e-30, 1e12, False),
     "flip_probability": (0.0, 1.0, False),
     "orientation_outlier": (1e-12, 0.999, False),
     "category_error": (1e-9, 0.499, False),
@@ -34,12 +35,12 @@ _LIMITS: dict[str, tuple[float, float, bool]] = {
     "track_minimum": (1, 10**9, True),
     "motion_log_odds": (0.0, 1e12, False),
     "samples": (8, 100_000, True),
-    "constellation_size": (2, 10_000, True),
-    "constellation_minimum": (2, 10_000, True),
-    "constellation_log_odds": (-1e6, 1e6, False),
-    "constellation_rounds": (0, 10_000, True),
+    "clique_window": (2, 10_000, True),
+    "clique_minimum": (2, 10_000, True),
+    "clique_log_odds": (-1e6, 1e6, False),
+    "clique_rounds": (0, 10_000, True),
     "em_iterations": (0, 10_000, True),
-    "link_minimum": (0.0, 1.0, False),
+    "equality_minimum": (0.0, 1.0, False),
     "merge_weight": (0.0, 1.0, False),
     "robust_width": (1e-6, 1e6, False),
     "hypotheses": (1, 1000, True),
@@ -60,6 +61,15 @@ def _check_number(name: str, value: object, low: float, high: float, whole: bool
         raise input_error(f"setting `{name}` is out of range", got=value, expected=f"{kind} from {low:g} to {high:g}")
 
 
+@renamed_options(
+    new_rate="birth_intensity",
+    clutter_rate="clutter_intensity",
+    constellation_size="clique_window",
+    constellation_minimum="clique_minimum",
+    constellation_log_odds="clique_log_odds",
+    constellation_rounds="clique_rounds",
+    link_minimum="equality_minimum",
+)
 @dataclass(frozen=True)
 class SlamConfig:
     """How objects are tracked, associated and mapped. None: estimated from the data.
@@ -95,10 +105,10 @@ class SlamConfig:
     latent_correlation: float | None = None
     """Correlation of the latent's errors in two detections of one object. None: 0, and in a run from images what the model's
     calibration says. Without it many views of one side would pass for certainty about the whole shape."""
-    new_rate: float | None = None
-    """Density of landmarks not seen before, per m^3 of the observed space."""
-    clutter_rate: float | None = None
-    """Density of false detections, per m^3 of the observed space and frame."""
+    birth_intensity: float | None = None
+    """Intensity of landmarks not seen before: their expected number per m^3 of the observed space."""
+    clutter_intensity: float | None = None
+    """Intensity of clutter: expected number of false detections per m^3 of the observed space and frame."""
     field_of_view: tuple[float, float] | None = None
     """Full horizontal and vertical angle of the camera's view, rad (`2 arctan(width / 2 fx)`). None: learnt from where detections
     lie. Objects in view that are not detected speak against their existence."""
@@ -127,17 +137,17 @@ class SlamConfig:
     """Posterior samples of the linearised graph that carry all relative covariances."""
     annealing: tuple[float, ...] = (4.0, 2.0, 1.0)
     """Factors on the relative covariances in the first rounds; the last one stays."""
-    constellation_size: int = 14
-    """Tracklets a fresh constellation is made of."""
-    constellation_minimum: int = 3
-    """Pairs that must agree to close a loop by constellation."""
-    constellation_log_odds: float = 8.0
-    """Log evidence, in nats above new landmarks, that a constellation must reach."""
-    constellation_rounds: int = 8
-    """Most rounds of constellation closing."""
+    clique_window: int = 14
+    """Tracklets, one after the other in time, whose candidate pairs are searched together for a clique that closes a loop."""
+    clique_minimum: int = 3
+    """Pairs of tracklets that must be consistent with one another (a clique) to close a loop together."""
+    clique_log_odds: float = 8.0
+    """Log evidence, in nats above new landmarks, that a clique must reach."""
+    clique_rounds: int = 8
+    """Most rounds of closing loops by cliques."""
     em_iterations: int = 4
     """Iterations of the soft EM between tracklets after that."""
-    link_minimum: float = 0.02
+    equality_minimum: float = 0.02
     """Equalities of two tracklets of lower weight are left out of the M-step."""
     merge_weight: float = 0.5
     """Tracklets linked by more than this become one landmark."""

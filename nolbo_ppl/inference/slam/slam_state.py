@@ -95,7 +95,7 @@ def object_log_density(noise: NoiseModel) -> float:
 
     That is the density of detections a frame, five times the rate of first ones. A gap's density is weighed against it.
     """
-    return float(np.log(5.0 * noise.new_rate))
+    return float(np.log(5.0 * noise.birth_intensity))
 
 
 def link_scale(noise: NoiseModel) -> float:

@@ -52,9 +52,11 @@ class Tracklets:
 class Tracker:
     """The live tracks, advanced frame by frame; what the batch front end and the online one share."""
 
-    def __init__(self, config: SlamConfig, dimension: int, prior: FeaturePrior, new_rate: float, clutter_rate: float) -> None:
+    def __init__(
+        self, config: SlamConfig, dimension: int, prior: FeaturePrior, birth_intensity: float, clutter_intensity: float
+    ) -> None:
         self.config, self.prior = config, prior
-        self.new_rate, self.clutter_rate = new_rate, clutter_rate
+        self.birth_intensity, self.clutter_intensity = birth_intensity, clutter_intensity
         self.index = np.zeros(0, dtype=np.int64)
         self.mean = np.zeros((0, 3))
         self.covariance = np.zeros((0, 3, 3))
@@ -87,8 +89,8 @@ class Tracker:
         seen, n = measurements, len(measurements)
         count = max(seen.modes.log_weight.shape[1], self.modes.log_weight.shape[1])
         modes, self.modes = seen.modes.padded(count), self.modes.padded(count)
-        log_new = seen.log_object + np.log(self.new_rate)
-        log_clutter = seen.log_clutter + np.log(self.clutter_rate)
+        log_new = seen.log_object + np.log(self.birth_intensity)
+        log_clutter = seen.log_clutter + np.log(self.clutter_intensity)
         k, j, value = self._log_odds(seen, modes)
         found_pairs = frame_marginals(
             np.zeros(n, dtype=np.int64), k, j, value, np.logaddexp(log_new, log_clutter), associator=self.config.associator
@@ -187,7 +189,7 @@ def build_tracklets(problem: SlamProblem, noise: NoiseModel, config: SlamConfig,
         order = np.argsort(table.frame, kind="stable")
         frames, starts = np.unique(table.frame[order], return_index=True)
         groups = dict(zip(frames.tolist(), np.split(order, starts[1:])))
-        tracker = Tracker(config, table.latent_dim, prior, noise.new_rate, noise.clutter_rate)
+        tracker = Tracker(config, table.latent_dim, prior, noise.birth_intensity, noise.clutter_intensity)
         for t in progress_bar(range(int(frames[0]), int(frames[-1]) + 1), "tracking", "frame", leave=False):
             if t:
                 tracker.predict(problem.odometry[t], t, noise.rotation_step[t - 1], noise.translation_step[t - 1])

@@ -35,7 +35,7 @@ def test_batch_is_the_weighted_mean() -> None:
     T, seen, C, mean = views()
     table = Detections.from_arrays(np.arange(12), seen, position_covariance=C)
     covariance = np.tile(STILL**2 * np.eye(6), (11, 1, 1))
-    config = SlamConfig(correct_scales=False, new_rate=1e-12, clutter_rate=1e-20)
+    config = SlamConfig(correct_scales=False, birth_intensity=1e-12, clutter_intensity=1e-20)
     state = init(SlamProblem(T, table, covariance), config)
     assert len(state.static) == 1 and state.weight.min() > 0.999
     np.testing.assert_allclose(state.estimate.T_world_landmark[0, :3, 3], mean, atol=0.01)
@@ -47,7 +47,7 @@ def test_batch_is_the_weighted_mean() -> None:
 def test_online_is_the_weighted_mean() -> None:
     T, seen, C, mean = views()
     covariance = STILL**2 * np.eye(6)
-    slam = IncrementalSlam(SlamConfig(correct_scales=False, new_rate=1e-12, clutter_rate=1e-20))
+    slam = IncrementalSlam(SlamConfig(correct_scales=False, birth_intensity=1e-12, clutter_intensity=1e-20))
     for k in range(12):
         one = Detections.from_arrays([0], seen[[k]], position_covariance=C[[k]], id=[f"d{k}"])
         slam.update(T[k], one, odometry_covariance=None if k == 0 else covariance)

@@ -125,16 +125,16 @@ def test_constellation_is_found_and_twins_are_refused() -> None:
     found, m = closing(position, samples)
     assert found is not None and sorted(zip(found.a.tolist(), found.b.tolist())) == [(m - 6 + i, i) for i in range(6)]  # type: ignore[attr-defined]
     config = SlamConfig()
-    assert found.margin > config.constellation_log_odds  # type: ignore[attr-defined]
+    assert found.margin > config.clique_log_odds  # type: ignore[attr-defined]
     twins, _ = closing(*second_pass(np.array([3.0, 0.1, -2.0]), wrong=np.array([5.0, 0.2, -3.5]))[:2])
-    assert twins is not None and twins.margin < config.constellation_log_odds / 2  # type: ignore[attr-defined]
+    assert twins is not None and twins.margin < config.clique_log_odds / 2  # type: ignore[attr-defined]
 
 
 def test_closings_use_no_tracklet_twice() -> None:
     position, samples, _ = second_pass(np.array([3.0, 0.1, -2.0]))
     first = np.concatenate([np.arange(6), 1000 + np.arange(6)])
     data = features(12, first=first)
-    config = replace(SlamConfig(), constellation_size=4)
+    config = replace(SlamConfig(), clique_window=4)
     pairs = candidate_pairs(poses(position), samples, data, PRIOR, config, inflation=1.0, floor=0.05)
     accepted = close_constellations(
         pairs, first, poses(position), samples, config, inflation=1.0, floor=0.05, log_new=float(np.log(1e-3))

@@ -19,7 +19,7 @@ from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_d
 from nolbo_ppl.inference.slam.slam_state import SlamState
 from nolbo_ppl.structures.detections import Detections
 
-EXACT = SlamConfig(odometry_rotation_scale=1e-7, odometry_translation_scale=1e-7, new_rate=0.01, clutter_rate=0.02)
+EXACT = SlamConfig(odometry_rotation_scale=1e-7, odometry_translation_scale=1e-7, birth_intensity=0.01, clutter_intensity=0.02)
 
 
 def standing(points: np.ndarray, owner: np.ndarray, scale: float = 0.3) -> SlamState:
@@ -34,7 +34,7 @@ def test_evidence_of_still_camera_is_the_normal_integral() -> None:
     rng = np.random.default_rng(0)
     points = np.array([2.0, 0.0, 5.0]) + 0.3 * rng.standard_normal((6, 3))
     wide = 1e3
-    clutter = np.log(EXACT.clutter_rate or 1)
+    clutter = np.log(EXACT.clutter_intensity or 1)
 
     def exact(groups: list[list[int]]) -> float:
         value = 0.0
@@ -45,7 +45,7 @@ def test_evidence_of_still_camera_is_the_normal_integral() -> None:
             for axis in range(3):
                 value += multivariate_normal.logpdf(points[rows, axis] - points[rows, axis].mean(), np.zeros(n), covariance)
                 value += 0.5 * np.log(2 * np.pi * wide**2)
-            value += np.log(EXACT.new_rate or 1) - n * clutter
+            value += np.log(EXACT.birth_intensity or 1) - n * clutter
         return value
 
     one = standing(points, np.zeros(6, int))

@@ -114,7 +114,7 @@ def test_evidence_and_weights_equal_enumeration() -> None:
         latent_scale=spread,
         objectness=q,
     )
-    config = replace(CONFIG, new_rate=0.02, clutter_rate=0.05, objectness_prior=0.7, correct_scales=False)
+    config = replace(CONFIG, birth_intensity=0.02, clutter_intensity=0.05, objectness_prior=0.7, correct_scales=False)
     mapped = np.array([[0.5], [1.0], [-1.0]])
     state = em_init(SlamProblem(T[None], table), config, landmarks, mapped)
     _, weights, evidence = e_step(state)
@@ -169,7 +169,7 @@ def test_an_orientation_that_says_nothing_costs_nothing(scale: float | None, wei
     table = Detections.from_arrays(
         [0], [[0.0, 0.0, 5.0]], position_scale=0.3, rotation=rotation, rotation_scale=scale, objectness=[0.9]
     )
-    config = replace(CONFIG, new_rate=1e-3, clutter_rate=1e-3, objectness_prior=0.5)
+    config = replace(CONFIG, birth_intensity=1e-3, clutter_intensity=1e-3, objectness_prior=0.5)
     state = em_init(SlamProblem(np.eye(4)[None], table), config, make_pose(np.eye(3), np.array([[0, 0, 5.0]])))
     assert e_step(state)[1][0, 0] > 0.99 * weight
 

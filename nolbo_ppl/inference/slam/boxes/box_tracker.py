@@ -42,7 +42,7 @@ class BoxConfig:
     """Largest depth, m."""
     gap: int = 8
     """A track ends after this many frames without a detection."""
-    new_rate: float = 1.0
+    birth_rate: float = 1.0
     """Detections of new objects and false ones expected in a frame."""
     minimum_views: int = 3
     """Tracks of fewer detections found no landmark."""
@@ -112,7 +112,7 @@ class BoxTracker:
         if len(self.index):
             point, J = self._projected(T_world_camera)
             logs, position = self._log_likelihood(point, J, rays)
-            null = np.full(len(rays), np.log(self.config.new_rate) - self.log_view - UNIFORM_LOG_HEIGHT)
+            null = np.full(len(rays), np.log(self.config.birth_rate) - self.log_view - UNIFORM_LOG_HEIGHT)
             pair = np.log1p(-MISSED) + logs.T
             weights = np.asarray(association_marginals(pair, null).weights)
             for n, m in np.argwhere(weights > 0.5):

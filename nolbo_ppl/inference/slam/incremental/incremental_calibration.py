@@ -11,7 +11,7 @@ from nolbo_ppl.inference.slam.initialise import init
 from nolbo_ppl.inference.slam.noise.noise_estimation import DEFAULT_TRANSLATION_RATIO, estimate_noise
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig, SlamProblem
 
-DEFAULT_RATE = 1e-3
+DEFAULT_INTENSITY = 1e-3
 """Density of new landmarks where nothing is known, per m^3; that of false detections is half of it."""
 
 
@@ -33,8 +33,11 @@ class IncrementalCalibration:
 
 def default_calibration(first: SlamProblem, config: SlamConfig) -> IncrementalCalibration:
     """Without a reference: stated scales and defaults, and the population of the first keyframe."""
-    new_rate, clutter_rate = config.new_rate or DEFAULT_RATE, config.clutter_rate or 0.5 * DEFAULT_RATE
-    config = replace(config, new_rate=new_rate, clutter_rate=clutter_rate)
+    birth_intensity, clutter_intensity = (
+        config.birth_intensity or DEFAULT_INTENSITY,
+        config.clutter_intensity or 0.5 * DEFAULT_INTENSITY,
+    )
+    config = replace(config, birth_intensity=birth_intensity, clutter_intensity=clutter_intensity)
     return IncrementalCalibration(config, fit_prior(first.observations, config, estimate_noise(first, config)))
 
 
@@ -74,7 +77,7 @@ def calibrate_incremental(reference: SlamProblem, config: SlamConfig) -> Increme
         position_ratio=growth,
         rotation_scale=angle,
         latent_scale=config.latent_scale or report.get("latent_scale"),
-        new_rate=noise.new_rate,
-        clutter_rate=noise.clutter_rate,
+        birth_intensity=noise.birth_intensity,
+        clutter_intensity=noise.clutter_intensity,
     )
     return IncrementalCalibration(config, state.prior, noise.position_factor, noise.range_factor, noise.rotation_factor)

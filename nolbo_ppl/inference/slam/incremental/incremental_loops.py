@@ -117,7 +117,7 @@ class LoopCloser:
         times = np.where(np.arange(len(everyone)) < len(old), frame + 1, frame)
         features = replace(features, first=times, last=times)
         a, b, weight, _ = soft_assignment(
-            pairs, features, np.arange(len(everyone)), object_log_density(noise), replace(self.config, link_minimum=1e-6)
+            pairs, features, np.arange(len(everyone)), object_log_density(noise), replace(self.config, equality_minimum=1e-6)
         )
         for i, j, w in zip(a.tolist(), b.tolist(), weight.tolist()):
             k = i - len(old)
@@ -157,7 +157,7 @@ class LoopCloser:
             self.flush(frame, graph)
         self.fresh = [j for j in self.fresh if j in self.map.landmarks]
         ended = [j for j in self.fresh if j not in live and frame - self.map.landmarks[j].last > 1]
-        half = max(self.config.constellation_size // 2, 1)
+        half = max(self.config.clique_window // 2, 1)
         if not ended or (len(ended) < half and frame - min(self.map.landmarks[j].last for j in ended) < LONGEST_WAIT):
             return 0
         taken = set(ended)
@@ -244,7 +244,7 @@ class LoopCloser:
         again = [
             j
             for j in self.map.numbers.tolist()
-            if j >= oldest - self.config.constellation_size and self.map.landmarks[j].first >= since
+            if j >= oldest - self.config.clique_window and self.map.landmarks[j].first >= since
         ]
         self.fresh = sorted({*self.fresh, *again})
         return True
@@ -310,7 +310,7 @@ def find_merges(
     outside = pairs.select(~np.isin(pairs.b, fresh))
     closing = find_loop_closure(outside, estimate, samples, config, inflation=1.0, floor=floor, log_new=log_new)
     found: list[tuple[int, int]] = []
-    least = config.constellation_log_odds
+    least = config.clique_log_odds
     if closing and closing.log_odds > least and closing.margin > least / 2:
         found += list(zip(closing.a.tolist(), closing.b.tolist()))
     used = [i for pair in found for i in pair]

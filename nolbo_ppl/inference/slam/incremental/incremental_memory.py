@@ -45,9 +45,9 @@ class IncrementalMemory:
 
     def new_tracker(self) -> Tracker:
         """A tracker without tracks, under the scales in use."""
-        new_rate, clutter_rate = self.config.new_rate, self.config.clutter_rate
-        assert new_rate is not None and clutter_rate is not None  # the calibration states both
-        return Tracker(self.config, len(self.prior.mean), self.prior, new_rate, clutter_rate)
+        birth_intensity, clutter_intensity = self.config.birth_intensity, self.config.clutter_intensity
+        assert birth_intensity is not None and clutter_intensity is not None  # the calibration states both
+        return Tracker(self.config, len(self.prior.mean), self.prior, birth_intensity, clutter_intensity)
 
     def live_landmarks(self) -> set[int]:
         """Landmarks that belong to tracks the tracker still follows."""

@@ -29,6 +29,7 @@ from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.io.npz import Npz, save_npz
+from nolbo_ppl.renamed_options import current_names, stored_names
 from nolbo_ppl.structures.detections import ARRAYS, TEXTS, Detections
 
 VERSION = 1
@@ -61,7 +62,7 @@ def save_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
     arrays: dict[str, Any] = {}
     meta: dict[str, Any] = {
         "version": VERSION,
-        "config": asdict(slam.config) | {"category_symmetry": dict(slam.config.category_symmetry)},
+        "config": stored_names(SlamConfig, asdict(slam.config) | {"category_symmetry": dict(slam.config.category_symmetry)}),
         "keyframes": asdict(slam.keyframes),
         "frames": slam.frames,
         "last_oriented": slam.last_oriented,
@@ -100,7 +101,7 @@ def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
             meta = json.loads(str(archive.array("meta", (), kinds="U")))
             if not isinstance(meta, dict) or meta.get("version") != VERSION:
                 raise input_error("not a saved online system", expected=f"version {VERSION}", file=path)
-            config = dict(meta["config"])
+            config = current_names(SlamConfig, meta["config"])
             for name in ("objectness_limits", "annealing"):
                 config[name] = tuple(config[name])
             slam.config = SlamConfig(**config)

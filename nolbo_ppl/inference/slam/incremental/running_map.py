@@ -144,13 +144,13 @@ def count_detections(
         score: log likelihood ratio of each detection's score, object over clutter.
         noise: the rates.
     """
-    ratio = score - np.log(noise.clutter_rate)
+    ratio = score - np.log(noise.clutter_intensity)
     information = np.array([j.information for j in landmarks])
     known = np.asarray(information.any(axis=(1, 2)))
     spread = np.linalg.inv(np.where(known.reshape(-1, 1, 1), information, np.eye(3))) + link_scale(noise) ** 2 * np.eye(3)
     value = ratio + log_normal(error, covariance + R_world_camera.T @ spread @ R_world_camera)
     value = np.logaddexp(np.log1p(-RIGHT_TRACK), np.log(RIGHT_TRACK) + value)
-    value = np.where(known, value, ratio + np.log(noise.new_rate))
+    value = np.where(known, value, ratio + np.log(noise.birth_intensity))
     more = R_world_camera @ np.linalg.inv(covariance) @ R_world_camera.T
     for k, landmark in enumerate(landmarks):
         landmark.log_odds += float(value[k])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ def halfway(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedSequence
 
 def test_what_is_loaded_goes_on_bit_for_bit(halfway: tuple[SimulatedSequence, IncrementalSlam, Path]) -> None:
     drive, slam, path = halfway
+    with Npz(path) as archive:  # settings under the names that files of 0.1.0 have
+        assert "new_rate" in json.loads(str(archive.array("meta", (), kinds="U")))["config"]
     again, table = IncrementalSlam.load(path), drive.observations
     for t in range(80, 100):
         rows = table.select(table.frame == t)

@@ -70,7 +70,7 @@ def test_modes_are_bounded() -> None:
         ("seed", -1),
         ("annealing", (4.0, float("nan"))),
         ("annealing", ()),
-        ("new_rate", float("inf")),
+        ("birth_intensity", float("inf")),
         ("em_iterations", 2.5),
         ("hypotheses", 0),
         ("odometry_rotation_scale", True),
