@@ -26,6 +26,7 @@ from nolbo_ppl.data.simulated_boxes import BoxDetectorConfig, simulate_boxes
 from nolbo_ppl.geometry.pose import chain, relative, se3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_with_associations
 from nolbo_ppl.io.trajectories import match_times, read_trajectory
+from nolbo_ppl.metrics.association import landmark_to_object
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 
 CHI_SQUARE_90 = 6.251
@@ -48,12 +49,10 @@ class Arguments:
     """First seed."""
 
 
-def whose(result: SlamResult, object_of: np.ndarray) -> np.ndarray:
+def landmark_objects(result: SlamResult, object_of: np.ndarray) -> np.ndarray:
     """True object of each landmark, by weight; -1 for clutter."""
     found = result.associations
-    votes = np.zeros((len(result.landmarks), int(object_of.max(initial=0)) + 2))
-    np.add.at(votes, (found.landmark, object_of[found.row] + 1), found.weight)
-    return votes.argmax(axis=1) - 1
+    return landmark_to_object(object_of[found.row], found.landmark, len(result.landmarks), found.weight)[0]
 
 
 def simulated(seed: int, with_heights: bool) -> dict[str, Any]:
@@ -71,7 +70,7 @@ def simulated(seed: int, with_heights: bool) -> dict[str, Any]:
     problem = SlamProblem(odometry, table)
     result = solve(problem)
     oracle = solve_with_associations(problem, object_of)
-    of, shown = whose(result, object_of), [one for one in result.landmarks if one.in_map]
+    of, shown = landmark_objects(result, object_of), [one for one in result.landmarks if one.in_map]
     squares = []
     for one in shown:
         if of[one.index] >= 0:

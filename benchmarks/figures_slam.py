@@ -20,9 +20,10 @@ from nolbo_ppl.data.converters import Converted, convert_kitti_poles, convert_ki
 from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConfig, simulate_sequence
 from nolbo_ppl.geometry.pose import inverse, relative, rotation_angle, se3_log
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_incremental, solve_with_associations
+from nolbo_ppl.inference.slam.map_files import association_table
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.io.trajectories import read_trajectory
-from nolbo_ppl.metrics.association import association_pairs, normalised_error_squared
+from nolbo_ppl.metrics.association import association_pairs, landmark_to_object, normalised_error_squared
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align
 
 KINDS = ("distinct", "identical", "lookalike", "tracking", "ycb", "poles", "online")
@@ -74,25 +75,6 @@ def ate(T: np.ndarray, truth: np.ndarray, rows: np.ndarray | None = None) -> flo
     return absolute_trajectory_error(T[use], truth[use]).rmse
 
 
-def labels(result: SlamResult) -> np.ndarray:
-    """Landmark of each detection, -1 for none."""
-    found = result.associations
-    out = np.full(len(found.new), -1)
-    strong = found.weight > 0.5
-    out[found.row[strong]] = found.landmark[strong]
-    return out
-
-
-def majority(truth: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
-    """True object most detections of each landmark are of, -1 for clutter."""
-    out = np.full(count, -1)
-    for j in range(count):
-        mine = truth[(label == j) & (truth >= 0)]
-        if len(mine):
-            out[j] = np.bincount(mine).argmax()
-    return out
-
-
 def make_drive(arguments: Arguments, kind: str, seed: int, sequence: str = "00") -> tuple[SimulatedSequence, SlamConfig]:
     """A path of KITTI with simulated objects, odometry noise giving about 20 to 45 m on 00."""
     path = arguments.data / "kitti_odometry" / "poses" / f"{sequence}.txt"
@@ -117,11 +99,11 @@ def simulated(arguments: Arguments, kind: str, seed: int, sequence: str = "00") 
     problem = SlamProblem(drive.odometry, drive.observations)
     result = solve(problem, config)
     oracle = solve_with_associations(problem, drive.object_of, config)
-    label = labels(result)
+    label = association_table(result).landmark_of
     score = association_pairs(drive.observations.frame, drive.object_of, label, 50)
     covariance = result.pose_covariances()[1:]
     error = se3_log(relative(result.T_world_camera, drive.truth))[1:]
-    owner = majority(drive.object_of, label, len(result.landmarks))
+    owner, _ = landmark_to_object(drive.object_of, label, len(result.landmarks))
     known = np.flatnonzero(owner >= 0)
     gap = np.array([result.landmarks[j].T_world_object[:3, 3] - drive.world.position[owner[j]] for j in known])
     spread = np.array([result.landmarks[j].position_covariance for j in known])
@@ -159,7 +141,7 @@ def converted(name: str, data: Converted, gap: int) -> tuple[SlamResult, Row]:
     objects = np.where(static, np.unique([o or "" for o in data.objects], return_inverse=True)[1], -1)
     result = solve(problem)
     oracle = solve_with_associations(problem, objects, result.state.config, result.state.noise)
-    label, frame = labels(result), data.observations.frame
+    label, frame = association_table(result).landmark_of, data.observations.frame
     labelled = static if name.startswith("tracking") else np.ones(len(static), bool)
     loops = association_pairs(frame[labelled], objects[labelled], label[labelled], gap)
     pairs = association_pairs(frame[static], objects[static], label[static])
@@ -181,7 +163,7 @@ def objects_right(result: SlamResult, data: Converted) -> Row:
     """
     truth = data.truth.T_world_camera
     correction = align(result.T_world_camera, truth)[0] @ inverse(result.T_world_camera[0])
-    label, frame = labels(result), data.observations.frame
+    label, frame = association_table(result).landmark_of, data.observations.frame
     seen = aligned = 0
     for name, true in data.T_world_object.items():
         rows = np.flatnonzero(np.array([o == name for o in data.objects]) & (label >= 0))

@@ -26,7 +26,6 @@ from nolbo_ppl.evaluation.sequence_scores import (
     detection_scores,
     finite,
     landmark_errors,
-    landmark_to_object,
     matched_ground_truth,
     position_scores,
 )
@@ -36,6 +35,7 @@ from nolbo_ppl.io.files import write_json
 from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.run_folder import RunFolder
 from nolbo_ppl.io.trajectories import COVARIANCE, Trajectory, write_trajectory
+from nolbo_ppl.metrics.association import landmark_to_object
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.odometry import OdometryConfig
 from nolbo_ppl.pipeline.mapping_pipeline import run_pipeline

@@ -28,8 +28,9 @@ from nolbo_ppl.data.simulate import (
 )
 from nolbo_ppl.geometry.pose import inverse, make_pose, relative, se3_log, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_with_associations
+from nolbo_ppl.inference.slam.map_files import association_table
 from nolbo_ppl.io.observations import Detections
-from nolbo_ppl.metrics.association import normalised_error_squared
+from nolbo_ppl.metrics.association import landmark_to_object, normalised_error_squared
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
 
@@ -118,20 +119,6 @@ def room(seed: int, arguments: Arguments) -> SimulatedSequence:
     return SimulatedSequence(truth, odometry, replace(table, category=names), source, world)
 
 
-def landmark_to_object(result: SlamResult, object_of: np.ndarray) -> np.ndarray:
-    """True object most detections of each landmark are of, -1 for clutter."""
-    found = result.associations
-    label = np.full(len(found.new), -1)
-    strong = found.weight > 0.5
-    label[found.row[strong]] = found.landmark[strong]
-    out = np.full(len(result.landmarks), -1)
-    for j in range(len(out)):
-        mine = object_of[label == j]
-        if len(mine) and (mine >= 0).mean() > 0.5:
-            out[j] = np.bincount(mine[mine >= 0]).argmax()
-    return out
-
-
 def figures(world: SimulatedSequence, result: SlamResult, oracle_T: np.ndarray) -> dict[str, float]:
     """Errors, squared normalised errors per degree of freedom, counts."""
     assert world.world is not None
@@ -141,7 +128,7 @@ def figures(world: SimulatedSequence, result: SlamResult, oracle_T: np.ndarray) 
     pose = normalised_error_squared(
         se3_log(relative(result.T_world_camera, world.truth))[1:], result.pose_covariances()[1:]
     ).mean()
-    owner = landmark_to_object(result, world.object_of)
+    owner, _ = landmark_to_object(world.object_of, association_table(result).landmark_of, len(result.landmarks))
     known = np.flatnonzero(owner >= 0)
     seen = len(np.unique(world.object_of[world.object_of >= 0]))
     out = {

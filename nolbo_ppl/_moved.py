@@ -264,6 +264,7 @@ RENAMED: dict[str, dict[str, str]] = {
     "structures.object_posteriors": {"Observations": "ObjectPosteriors"},
     "synthetic.assets.shape_library": {"ShapePool": "ShapeLibrary"},
     "synthetic.renderer.camera_view": {"Backdrop": "Environment"},
+    "synthetic.scenes.background_images": {"Photographs": "BackgroundImages"},
     "synthetic.scenes.environment": {"sample_backdrop": "sample_environment"},
     "synthetic.scenes.scene_generator": {"SceneSource": "SceneGenerator"},
     "synthetic.worlds": {

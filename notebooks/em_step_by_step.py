@@ -27,6 +27,7 @@ from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circui
 from nolbo_ppl.inference.association import association_marginals
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, em_init, em_solve, finish, init, step
 from nolbo_ppl.inference.slam.reference_em import e_step
+from nolbo_ppl.metrics.association import landmark_to_object
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
 
 LAP = 80
@@ -85,18 +86,8 @@ axis.legend(frameon=False, fontsize=8)
 
 
 # %%
-def majority(rows, group, count):
-    """True object of each group of detections, -1 for none."""
-    out = np.full(count, -1)
-    for j in range(count):
-        own = drive.object_of[rows[group == j]]
-        own = own[own >= 0]
-        out[j] = np.bincount(own).argmax() if len(own) else -1
-    return out
-
-
 first = np.flatnonzero(~second)
-object_of_landmark = majority(state.rows, state.landmark, len(second))[first]
+object_of_landmark = landmark_to_object(drive.object_of[state.rows], state.landmark, len(second))[0][first]
 later = (table.frame >= LAP) & (drive.object_of >= 0)
 seen_in_both = [j for j in object_of_landmark if j >= 0 and (drive.object_of[later] == j).any()]
 common = np.array(list(dict.fromkeys(seen_in_both)))
@@ -196,9 +187,8 @@ axes[1].set(title="motion of the cameras, m", xlabel="iteration")
 
 # %%
 final, associations = finish(state)
-strongest = np.full(len(table), -1)
-strongest[associations.row[associations.weight > 0.5]] = associations.landmark[associations.weight > 0.5]
-object_of_final = majority(np.arange(len(table)), strongest, len(final.static))
+object_of = drive.object_of[associations.row]
+object_of_final, _ = landmark_to_object(object_of, associations.landmark, len(final.static), associations.weight)
 shown_columns = np.array([j for k in common for j in np.flatnonzero(object_of_final == k)])
 after = np.zeros((len(common), len(final.static)))
 for row, k in enumerate(common):

@@ -30,9 +30,10 @@ import numpy as np
 from nolbo_ppl.cli.slam import SlamRunConfig, run
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_sequence
 from nolbo_ppl.geometry.pose import make_pose
+from nolbo_ppl.inference.slam.map_files import association_table
 from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.io.trajectories import Trajectory, read_trajectory, write_trajectory
-from nolbo_ppl.metrics.association import association_pairs, normalised_error_squared
+from nolbo_ppl.metrics.association import association_pairs, landmark_to_object, normalised_error_squared
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error, align, path_length
 
 TRUTH, VO, OWN, OBJECT = "black", "#9aa3ab", "#4e79a7", "#e15759"
@@ -150,9 +151,7 @@ axis.legend(frameon=False, fontsize=8)
 # of those the map joins are right (precision), and how many of the true ones it found (recall).
 
 # %%
-found = result.associations
-landmark_of = np.full(len(drive.observations), -1)
-landmark_of[found.row[found.weight > 0.5]] = found.landmark[found.weight > 0.5]
+landmark_of = association_table(result).landmark_of
 score = association_pairs(drive.observations.frame, drive.object_of, landmark_of, minimum_gap=50)
 print(f"loop pairs: {score.true_pairs} true, {score.found_pairs} found")
 print(f"precision {score.precision:.3f}, recall {score.recall:.3f}")
@@ -176,11 +175,7 @@ axis.legend(frameon=False, fontsize=8, markerscale=2)
 # landmarks share the camera's drift: one drive is a few draws of it, not a hundred. Average over drives before you conclude.
 
 # %%
-object_of_landmark = np.full(len(result.landmarks), -1)
-for j in range(len(result.landmarks)):
-    own = drive.object_of[(landmark_of == j) & (drive.object_of >= 0)]
-    if len(own):
-        object_of_landmark[j] = np.bincount(own).argmax()
+object_of_landmark, _ = landmark_to_object(drive.object_of, landmark_of, len(result.landmarks))
 matched = np.flatnonzero(object_of_landmark >= 0)
 fixed = truth[0] @ np.linalg.inv(result.T_world_camera[0])
 error = np.array([(fixed @ result.landmarks[j].T_world_object)[:3, 3] for j in matched])

@@ -17,7 +17,7 @@ from scipy.special import gammainc
 from nolbo_ppl.geometry.pose import inverse, relative, se3_log, so3_exp, so3_log
 from nolbo_ppl.inference.slam import SlamResult
 from nolbo_ppl.io.true_objects import CLUTTER, UNKNOWN, TrueObjects
-from nolbo_ppl.metrics.association import normalised_error_squared
+from nolbo_ppl.metrics.association import landmark_to_object, normalised_error_squared
 from nolbo_ppl.metrics.stated_probabilities import probability_record, region_record
 from nolbo_ppl.metrics.trajectory import known_rows
 
@@ -53,15 +53,11 @@ def landmark_objects(
     Detections of which nobody knows what they are of are left out; landmarks of nothing else are `UNKNOWN`.
     """
     found, m = result.associations, len(result.state.static)
-    of = object_of[found.row]
-    known = of != UNKNOWN
-    objects = int(object_of.max(initial=-1)) + 1
-    votes = np.zeros((m, objects + 1))
-    np.add.at(votes, (found.landmark[known], of[known]), found.weight[known])  # clutter is the last column
-    owner = np.argmax(votes, axis=1)
-    total = votes.sum(axis=1)
-    owner = np.where(total <= 0, UNKNOWN, np.where(owner == objects, CLUTTER, owner))
-    return owner, 1 - votes[:, -1] / np.maximum(total, 1e-9)
+    known = object_of[found.row] != UNKNOWN
+    of, landmark, weight = object_of[found.row[known]], found.landmark[known], found.weight[known]
+    owner, share = landmark_to_object(of, landmark, m, weight)
+    total, clutter = np.bincount(landmark, weight, m), np.bincount(landmark, weight * (of == CLUTTER), m)
+    return np.where(share > 0, owner, UNKNOWN), 1 - clutter / np.maximum(total, 1e-9)
 
 
 def background_cases(result: SlamResult, object_of: Int[np.ndarray, " k"]) -> Cases:

@@ -171,19 +171,6 @@ def loop_scores(
     }
 
 
-def landmark_to_object(
-    object_of: Int[np.ndarray, " k"], landmark_of: Int[np.ndarray, " k"], landmarks: int
-) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Object most detections of each landmark are of (-1: of none), and the share of its detections that are."""
-    owner, purity = np.full(landmarks, -1), np.zeros(landmarks)
-    for j in range(landmarks):
-        values, counts = np.unique(object_of[landmark_of == j], return_counts=True)
-        if len(values):
-            best = int(np.argmax(counts))
-            owner[j], purity[j] = values[best], counts[best] / counts.sum()
-    return owner, purity
-
-
 def map_scores(
     object_of: Int[np.ndarray, " k"],
     owner: Int[np.ndarray, " m"],

@@ -84,6 +84,35 @@ def association_pairs(
     )
 
 
+def landmark_to_object(
+    object_of: Int[np.ndarray, " k"],
+    landmark_of: Int[np.ndarray, " k"],
+    landmarks: int,
+    weight: Float[np.ndarray, " k"] | None = None,
+) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """True object of each landmark, the one most of its detections are of, and the share of them that are.
+
+    Args:
+        object_of: true object of each detection, or of the detection of each association; a negative number is none.
+        landmark_of: its landmark, -1 for none.
+        landmarks: number of landmarks. One without a detection has the object -1 and the share 0.
+        weight: how much each counts; 1 by default. Of equal votes the smaller number wins.
+
+    Example:
+        >>> landmark_to_object(np.array([4, 4, -1, 7]), np.array([0, 0, 0, -1]), 2)
+        (array([ 4, -1]), array([0.66666667, 0.        ]))
+    """
+    owner, purity = np.full(landmarks, -1), np.zeros(landmarks)
+    counted = (landmark_of >= 0) & (True if weight is None else weight > 0)
+    pair, number = np.unique(np.stack([landmark_of[counted], object_of[counted]]), axis=1, return_inverse=True)
+    votes = np.bincount(number.reshape(-1), None if weight is None else weight[counted], minlength=pair.shape[1])
+    order = np.lexsort((-votes, pair[0]))  # stable: equal votes stay in the order of the objects' numbers
+    best = order[np.flatnonzero(np.diff(pair[0][order], prepend=-1))]
+    owner[pair[0][best]] = pair[1][best]
+    purity[pair[0][best]] = votes[best] / np.bincount(pair[0], votes, minlength=landmarks)[pair[0][best]]
+    return owner, purity
+
+
 def normalised_error_squared(error: Float[np.ndarray, "n d"], covariance: Float[np.ndarray, "n d d"]) -> Float[np.ndarray, " n"]:
     """NEES per degree of freedom, `e' S^-1 e / d` (Bar-Shalom): 1 on average when covariances are right.
 

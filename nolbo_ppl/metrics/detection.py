@@ -51,6 +51,11 @@ class PrecisionRecall:
     precision: Float[np.ndarray, " k"]
     recall: Float[np.ndarray, " k"]
 
+    @property
+    def area(self) -> float:
+        """Average precision without interpolation, `sum_t (recall_t - recall_t-1) precision_t`."""
+        return float((np.diff(self.recall, prepend=0.0) * self.precision).sum())
+
 
 def match_image(
     box: Float[np.ndarray, "n 4"],

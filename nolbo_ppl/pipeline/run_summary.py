@@ -15,7 +15,6 @@ from nolbo_ppl.evaluation.sequence_scores import (
     detection_scores,
     finite,
     landmark_errors,
-    landmark_to_object,
     loop_scores,
     map_scores,
     matched_ground_truth,
@@ -32,6 +31,7 @@ from nolbo_ppl.evaluation.sequence_truth import (
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
 from nolbo_ppl.io.noise_file import read_noise
 from nolbo_ppl.io.run_folder import RunFolder
+from nolbo_ppl.metrics.association import landmark_to_object
 from nolbo_ppl.metrics.trajectory import path_length, trajectory_errors
 from nolbo_ppl.odometry import StepFlag
 from nolbo_ppl.structures.detections import Detections

@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from nolbo_ppl.evaluation.labelled_scenes import Scenes
 from nolbo_ppl.geometry.voxels import unpack_voxels
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
+from nolbo_ppl.metrics.detection import PrecisionRecall
 from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_iou
 from nolbo_ppl.progress import progress_bar
@@ -99,25 +100,16 @@ def _shapes(model: ObservationModel, packed: np.ndarray | None, latent: np.ndarr
     return found
 
 
-@dataclass(frozen=True)
-class PrecisionRecall:
-    """A curve over falling thresholds of the occupancy probability, all voxels of all objects together."""
+def occupancy_curve(occupied: Int[np.ndarray, "n bins"], empty: Int[np.ndarray, "n bins"]) -> PrecisionRecall:
+    """Precision and recall of occupancy (NOLBO, figure of 3D reconstruction) from counts of voxels by probability.
 
-    precision: Float[np.ndarray, " t"]
-    recall: Float[np.ndarray, " t"]
-
-    @property
-    def average_precision(self) -> float:
-        """`sum_t (recall_t - recall_t-1) precision_t`."""
-        return float((np.diff(self.recall, prepend=0.0) * self.precision).sum())
-
-
-def precision_recall(occupied: Int[np.ndarray, "n bins"], empty: Int[np.ndarray, "n bins"]) -> PrecisionRecall:
-    """Precision and recall of occupancy (NOLBO, figure of 3D reconstruction) from counts of voxels by probability."""
+    All voxels of all objects together; thresholds are the lower edges of the bins.
+    """
     hits = np.cumsum(occupied.sum(0)[::-1])
     found = hits + np.cumsum(empty.sum(0)[::-1])
     some = found > 0
-    return PrecisionRecall(hits[some] / found[some], hits[some] / max(hits[-1], 1))
+    threshold = np.arange(len(found) - 1, -1, -1) / len(found)
+    return PrecisionRecall(threshold[some], hits[some] / found[some], hits[some] / max(hits[-1], 1))
 
 
 def nearest_category_accuracy(latent: Float[np.ndarray, "n d"], category: Int[np.ndarray, " n"], neighbours: int = 5) -> float:

@@ -9,17 +9,17 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.categories import CATEGORIES
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.metrics.detection import PrecisionRecall
 from nolbo_ppl.metrics.intervals import IntervalEstimate, estimate, resample_weights, widened
 from nolbo_ppl.metrics.statistics import Weights, by_group, mean_of_defined, weighted_mean, weighted_median
 from nolbo_ppl.metrics.viewpoint_error import ACCURATE
 from nolbo_ppl.reproduction.budgets import NETWORKS, ReproduceConfig
 from nolbo_ppl.reproduction.object_answers import (
     ObjectAnswers,
-    PrecisionRecall,
     answers_at_boxes,
     categories_shown,
     nearest_category_accuracy,
-    precision_recall,
+    occupancy_curve,
 )
 from nolbo_ppl.reproduction.paper_numbers import ACCURACY, MEDIAN_ERROR
 from nolbo_ppl.reproduction.paper_numbers import CATEGORIES as PAPER_CATEGORIES
@@ -131,13 +131,13 @@ def reconstruction(config: ReproduceConfig) -> tuple[ResultTable, dict[str, Prec
         for seed in range(config.networks_of_each):
             found = answers(config, name, seed)
             part = found.select(np.isin(found.category, some))
-            curve = precision_recall(found.occupied, found.empty)
+            curve = occupancy_curve(found.occupied, found.empty)
             curves.setdefault(NETWORKS[name].title, curve)
             figures.append(
                 (
-                    curve.average_precision,
+                    curve.area,
                     _mean_iou(found.iou),
-                    precision_recall(part.occupied, part.empty).average_precision if part.occupied.any() else np.nan,
+                    occupancy_curve(part.occupied, part.empty).area if part.occupied.any() else np.nan,
                     _mean_iou(part.iou),
                 )
             )

@@ -15,7 +15,6 @@ from nolbo_ppl.evaluation.sequence_scores import (
     coverage_scores,
     detection_scores,
     landmark_errors,
-    landmark_to_object,
     loop_scores,
     map_scores,
     orientation_mass,
@@ -25,6 +24,7 @@ from nolbo_ppl.evaluation.sequence_scores import (
 from nolbo_ppl.evaluation.sequence_truth import MatchResult, read_ground_truth
 from nolbo_ppl.geometry.pose import make_pose, so3_exp, transform
 from nolbo_ppl.geometry.rotation import ray_rotation, viewpoint_to_matrix
+from nolbo_ppl.metrics.association import landmark_to_object
 from nolbo_ppl.structures.detections import Detections
 from tests.evaluation.test_sequence_truth import names
 from tests.simulated_sequence import SimulatedDrive

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.metrics.association import association_pairs, brier_score, normalised_error_squared
+from nolbo_ppl.metrics.association import association_pairs, brier_score, landmark_to_object, normalised_error_squared
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -32,6 +32,20 @@ def test_pairs_equal_brute_force(seed: int, gap: int) -> None:
 def test_nothing_found_is_precise_and_incomplete() -> None:
     score = association_pairs(np.array([0, 9]), np.array([1, 1]), np.array([-1, -1]))
     assert (score.precision, score.recall, score.f1) == (1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_object_of_a_landmark_equals_brute_force(weighted: bool) -> None:
+    rng = np.random.default_rng(5)
+    for count in (0, 1, 60):
+        truth, found = rng.integers(-2, 4, count), rng.integers(-1, 7, count)
+        weight = rng.integers(0, 3, count) / 4 if weighted else np.ones(count)  # ties, and associations of weight zero
+        owner, share = landmark_to_object(truth, found, 8, weight if weighted else None)
+        for j in range(8):
+            votes = {o: weight[(found == j) & (truth == o)].sum() for o in sorted(set(truth[found == j].tolist()))}
+            total = sum(votes.values())
+            best = max(votes, key=votes.__getitem__) if total else -1  # the first of equal ones: the smaller number
+            assert owner[j] == best and share[j] == pytest.approx(votes[best] / total if total else 0.0)
 
 
 def test_lengths_must_match() -> None:

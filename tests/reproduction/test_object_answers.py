@@ -17,7 +17,7 @@ from nolbo_ppl.reproduction.object_answers import (
     ObjectAnswers,
     answers_at_boxes,
     nearest_category_accuracy,
-    precision_recall,
+    occupancy_curve,
 )
 from nolbo_ppl.reproduction.paper_numbers import CATEGORIES as PAPER_CATEGORIES
 from nolbo_ppl.reproduction.tables_of_objects import accuracy_row, median_row, plane_map, prior_samples
@@ -37,14 +37,13 @@ def test_precision_and_recall_by_thresholds() -> None:
     probability = (rng.integers(0, BINS, 8**3) + 0.5) / BINS
     probability = np.where(truth, np.sqrt(probability), probability)
     probability = (np.floor(probability * BINS) + 0.5) / BINS
-    curve = precision_recall(*counts(probability, truth))
-    for k, edge in enumerate(np.unique(np.floor(probability * BINS) / BINS)[::-1]):
-        above = probability > edge
-        assert curve.recall[-1] == 1.0
-        matching = np.flatnonzero(np.isclose(curve.recall, truth[above].sum() / truth.sum()))
-        assert np.isclose(curve.precision[matching], truth[above].mean()).any(), k
+    curve = occupancy_curve(*counts(probability, truth))
+    assert (np.diff(curve.threshold) < 0).all() and curve.recall[-1] == 1.0
+    for threshold, precision, recall in zip(curve.threshold, curve.precision, curve.recall):
+        above = probability >= threshold
+        assert recall == pytest.approx(truth[above].sum() / truth.sum()) and precision == pytest.approx(truth[above].mean())
     exact = voxel_average_precision(probability.reshape(1, 8, 8, 8), truth.reshape(1, 8, 8, 8))
-    assert curve.average_precision == pytest.approx(float(exact[0]), abs=1e-9)
+    assert curve.area == pytest.approx(float(exact[0]), abs=1e-9)
 
 
 def test_neighbours_of_the_same_category() -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import OrderedDict
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from nolbo_ppl._moved import renamed
 from nolbo_ppl.io.images import images_of, open_image
 from nolbo_ppl.synthetic.renderer import textures
 from nolbo_ppl.synthetic.renderer.materials import hsv
@@ -25,7 +27,7 @@ def list_background_images(folder: str | PathLike[str]) -> list[Path]:
     return sorted(images_of(folder, recursive=True))
 
 
-class Photographs:
+class BackgroundImages:
     """Crops of the photographs of a folder; decoded ones are kept, at most twice as large as the scenes."""
 
     def __init__(self, folder: str | PathLike[str], size: int) -> None:
@@ -87,3 +89,7 @@ def drawn_background(rng: np.random.Generator, height: int, width: int) -> Float
         if inside.any():
             picture[inside] = layer((int(inside.sum()),), grid[inside])
     return picture
+
+
+if not TYPE_CHECKING:  # type checkers know the new names alone
+    __getattr__ = renamed(__name__)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.synthetic.renderer.camera_view import Environment, Light, Surface
 from nolbo_ppl.synthetic.renderer.materials import hsv
-from nolbo_ppl.synthetic.scenes.background_images import Photographs, drawn_background
+from nolbo_ppl.synthetic.scenes.background_images import BackgroundImages, drawn_background
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
 
 
@@ -87,7 +87,7 @@ def sample_environment(
     config: SceneConfig,
     rng: np.random.Generator,
     R_camera_world: Float[np.ndarray, "3 3"],
-    photographs: Photographs | None,
+    photographs: BackgroundImages | None,
 ) -> Environment:
     """Sky, ground, perhaps a wall; or a photograph or drawn picture in their place."""
     weights = np.array(config.backgrounds, dtype=np.float64)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.synthetic.assets.shape_library import INSTANCES, ShapeLibrary
-from nolbo_ppl.synthetic.scenes.background_images import Photographs
+from nolbo_ppl.synthetic.scenes.background_images import BackgroundImages
 from nolbo_ppl.synthetic.scenes.render_scene import Rendered, Scene, render_scene
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
 from nolbo_ppl.synthetic.scenes.scene_sampler import scene_at
@@ -42,9 +42,9 @@ class SceneGenerator:
         return ShapeLibrary(self.config.categories, seed=self.seed, instances=self.instances, cad=self.cad)
 
     @cached_property
-    def photographs(self) -> Photographs | None:
+    def photographs(self) -> BackgroundImages | None:
         """The photographs; listed once in each process."""
-        return None if self.backgrounds is None else Photographs(self.backgrounds, self.config.size)
+        return None if self.backgrounds is None else BackgroundImages(self.backgrounds, self.config.size)
 
     def __getstate__(self) -> dict:
         return {name: self.__dict__[name] for name in self.__dataclass_fields__}

@@ -13,7 +13,7 @@ from nolbo_ppl.synthetic.assets.shape_library import BLOCK, ShapeLibrary
 from nolbo_ppl.synthetic.renderer.camera_view import Mesh, MeshInstance, View
 from nolbo_ppl.synthetic.renderer.materials import Material, sample_material, sample_materials
 from nolbo_ppl.synthetic.scenes import distractors as clutter
-from nolbo_ppl.synthetic.scenes.background_images import Photographs
+from nolbo_ppl.synthetic.scenes.background_images import BackgroundImages
 from nolbo_ppl.synthetic.scenes.environment import daylight, sample_environment, sample_light
 from nolbo_ppl.synthetic.scenes.footprint import Footprint
 from nolbo_ppl.synthetic.scenes.occluders import sample_occluder
@@ -203,7 +203,7 @@ def sample_scene(
     config: SceneConfig,
     rng: np.random.Generator,
     pool: ShapeLibrary,
-    photographs: Photographs | None = None,
+    photographs: BackgroundImages | None = None,
     block: int = 0,
 ) -> Scene:
     """Draw a scene. Everything random comes from `rng`; objects that find no room are left out.
@@ -265,6 +265,8 @@ def sample_scene(
     )
 
 
-def scene_at(config: SceneConfig, seed: int, index: int, pool: ShapeLibrary, photographs: Photographs | None = None) -> Scene:
+def scene_at(
+    config: SceneConfig, seed: int, index: int, pool: ShapeLibrary, photographs: BackgroundImages | None = None
+) -> Scene:
     """Scene `index` of seed `seed`: depends on nothing else, however many processes share the work."""
     return sample_scene(config, np.random.default_rng([seed, index]), pool, photographs, index // BLOCK)

@@ -15,6 +15,7 @@ from nolbo_ppl.geometry.pose import make_pose, rotation_angle, so3_exp
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve
 from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.graph import SlamEstimate, add_observation_factors, resolve_observations, to_values
+from nolbo_ppl.inference.slam.map_files import association_table
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.orientation import (
@@ -25,6 +26,7 @@ from nolbo_ppl.inference.slam.orientation import (
     vertical_turns,
 )
 from nolbo_ppl.io.observations import Detections
+from nolbo_ppl.metrics.association import landmark_to_object
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
 Z = np.array([0.0, 0.0, 1.0])
@@ -189,11 +191,7 @@ def test_stated_modes_find_orientations_the_best_mode_misses() -> None:
     right = []
     for observations in (alone, modes):
         result = solve(SlamProblem(drive.odometry, observations), CONFIG)
-        found = result.associations
-        owner = [
-            np.bincount(drive.object_of[found.row[(found.landmark == j) & (found.weight > 0.5)]] + 1).argmax() - 1
-            for j in range(len(result.landmarks))
-        ]
+        owner, _ = landmark_to_object(drive.object_of, association_table(result).landmark_of, len(result.landmarks))
         error = [
             rotation_angle(drive.world.rotation[o].T @ result.landmarks[j].T_world_object[:3, :3])
             for j, o in enumerate(owner)

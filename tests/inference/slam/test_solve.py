@@ -20,6 +20,7 @@ from nolbo_ppl.inference.slam import (
     solve_with_associations,
     step,
 )
+from nolbo_ppl.inference.slam.map_files import association_table
 from nolbo_ppl.io.observations import Detections
 from nolbo_ppl.metrics.association import association_pairs
 from nolbo_ppl.metrics.trajectory import absolute_trajectory_error
@@ -35,11 +36,7 @@ def drive(seed: int = 0, detector: DetectorConfig | None = None, laps: int = 2, 
 
 
 def labels(result: SlamResult) -> np.ndarray:
-    found = result.associations
-    out = np.full(len(found.new), -1)
-    strong = found.weight > 0.5
-    out[found.row[strong]] = found.landmark[strong]
-    return out
+    return association_table(result).landmark_of
 
 
 def ate(T: np.ndarray, truth: np.ndarray) -> float:
