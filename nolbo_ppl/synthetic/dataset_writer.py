@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def _write(out: Path, source: SceneGenerator, count: int, workers: int) -> dict[
     else:
         write_json(made, description)
     if not (out / SCENES).is_file():
-        _render_missing(out, source, count, workers)
+        write_missing(_write_chunk, source, out, count, CHUNK, workers, "scene")
         _join(out, count)
     rows = [row for _, row in read_jsonl(out / SCENES)]
     objects = [thing for row in rows for thing in row["objects"]]
@@ -97,14 +98,27 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _render_missing(out: Path, source: SceneGenerator, count: int, workers: int) -> None:
+def write_missing(
+    write_chunk: Callable[[Any, Path, int, int], int], source: Any, out: Path, count: int, chunk: int, workers: int, unit: str
+) -> None:
+    """Write those of `count` images that are missing, `chunk` of them in a job; a chunk whose lines are there is done.
+
+    Args:
+        write_chunk: writes images `first` to `last` of a source, then their lines as `.parts/FIRST.jsonl`; returns how many.
+        source: what it takes the images from.
+        out: folder of the data set.
+        count: images in all.
+        chunk: images that one job writes.
+        workers: processes.
+        unit: what an image is, on the progress bar.
+    """
     (out / "images").mkdir(parents=True, exist_ok=True)
-    chunks = [(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
-    missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]
-    jobs = [(_write_chunk, (source, out, first, last)) for first, last in missing]
+    chunks = [(first, min(first + chunk, count)) for first in range(0, count, chunk)]
+    missing = [(first, last) for first, last in chunks if not (out / ".parts" / f"{first:06d}.jsonl").is_file()]
+    jobs = [(write_chunk, (source, out, first, last)) for first, last in missing]
     done = count - sum(last - first for first, last in missing)
-    with progress_bar(None, "writing scenes", "scene", total=count, done=done) as bar:
-        for number in parallel(jobs, workers):
+    with progress_bar(None, f"writing {unit}s", unit, total=count, done=done) as bar:
+        for number in parallel(jobs, min(workers, max(len(jobs), 1))):
             bar.update(number)
 
 

@@ -19,11 +19,10 @@ import torch
 from jaxtyping import Float
 
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.camera import guessed_pinhole
 from nolbo_ppl.geometry.rotation import allocentric_to_egocentric, matrix_to_quaternion, viewpoint_to_matrix
 from nolbo_ppl.io.files import atomic_path, write_json, write_jsonl
 
-FIELD_OF_VIEW = float(np.radians(60.0))
-"""Horizontal view of a camera that nobody states. Nothing is learnt from it: such objects have no position."""
 MIN_SIDE = 2.0
 """Boxes with a side below, px, are left out: they hold nothing to see."""
 
@@ -83,12 +82,6 @@ def pascal_rotation(viewpoint: Sequence[float], box: Sequence[float], intrinsics
     return allocentric_to_egocentric(allocentric, ray).numpy()
 
 
-def guessed_camera(size: tuple[int, int]) -> list[float]:
-    """[fx, fy, cx, cy] of a camera that sees `FIELD_OF_VIEW` across an image of this width and height."""
-    focal = size[0] / (2 * np.tan(FIELD_OF_VIEW / 2))
-    return [focal, focal, size[0] / 2, size[1] / 2]
-
-
 def scene_line(image: ArchiveImage, name: str, benchmark: bool = False) -> dict[str, Any]:
     """The line of `scenes.jsonl` of an image.
 
@@ -97,7 +90,8 @@ def scene_line(image: ArchiveImage, name: str, benchmark: bool = False) -> dict[
         name: path of the image in the folder of scenes.
         benchmark: truncated and occluded objects become regions to ignore, as the viewpoint benchmarks of PASCAL3D+ have it.
     """
-    camera = guessed_camera(image.size) if image.intrinsics is None else list(image.intrinsics)
+    # Nothing is learnt from a guessed camera: objects of such archives have no position.
+    camera = guessed_pinhole(*image.size).tolist() if image.intrinsics is None else list(image.intrinsics)
     limit = np.array([*image.size, *image.size], dtype=np.float64)
     objects, ignore = [], []
     for thing in image.objects:

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from nolbo_ppl.data.converters.archives import guessed_camera
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.camera import guessed_pinhole
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.files import write_json, write_jsonl
 from nolbo_ppl.io.images import open_image
@@ -81,7 +81,8 @@ def write_pseudo_labels(
                 for k in np.flatnonzero(kept & sure)
             ]
             ignore = [[round(float(v), 3) for v in box[k]] for k in np.flatnonzero(kept & ~sure)]
-            lines.append({"image": name, "intrinsics": guessed_camera((width, height)), "objects": objects, "ignore": ignore})
+            camera = guessed_pinhole(width, height).tolist()
+            lines.append({"image": name, "intrinsics": camera, "objects": objects, "ignore": ignore})
     counts = {
         "images": len(lines),
         "objects": sum(len(line["objects"]) for line in lines),

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from nolbo_ppl.data.sequences.bag_frames import BagFrames
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder
+from nolbo_ppl.geometry.camera import guessed_pinhole
 from nolbo_ppl.geometry.distortion import undistort_depth, undistort_image
 from nolbo_ppl.io.camera_files import CameraIntrinsics, camera_of_images, read_camera
 from nolbo_ppl.io.images import exif_focal_length
@@ -85,7 +86,7 @@ def guessed_camera(size: tuple[int, int], focal: float | None = None) -> tuple[C
     """
     width, height = size
     told = focal is not None
-    focal = focal if focal is not None else width / (2 * np.tan(np.pi / 6))
+    focal = focal if focal is not None else float(guessed_pinhole(width, height)[0])
     across = np.degrees(2 * np.arctan(width / 2 / focal))
     origin = "from the EXIF focal length" if told else "without any evidence"
     remark = (

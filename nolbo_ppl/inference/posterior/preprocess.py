@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from nolbo_ppl._moved import renamed
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.camera import guessed_pinhole
 
 Image = UInt8[np.ndarray, "h w 3"] | UInt8[Tensor, "3 h w"]
 """An image: a uint8 array of height x width x 3 colours, or a torch tensor with the colours first."""
@@ -40,10 +40,8 @@ class PreprocessedImage:
 
 
 def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 4"]:
-    """Intrinsics [fx, fy, cx, cy], px, of a camera that sees 60 degrees across: what is assumed when none are given."""
-    height, width = image.shape[:2]
-    focal = width / (2 * math.tan(math.radians(30)))
-    return np.array([focal, focal, width / 2, height / 2])
+    """Intrinsics [fx, fy, cx, cy], px, that are assumed when none are given: a camera that sees 60 degrees across."""
+    return guessed_pinhole(image.shape[1], image.shape[0])
 
 
 def as_sequence(images: Any) -> tuple[list[Any], bool]:

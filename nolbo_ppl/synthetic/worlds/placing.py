@@ -22,7 +22,7 @@ GAP = 0.04
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """A shape with its colours: look-alikes share it."""
 
     item: ShapeAsset
@@ -40,7 +40,7 @@ class WorldObject:
     """One object of a world."""
 
     id: str
-    look: Look
+    look: Appearance
     T_ground_object: Float[np.ndarray, "4 4"]
     """Pose of its box centre in the ground frame; of a moving object, in the first frame."""
     footprint: Footprint
@@ -59,10 +59,10 @@ class Catalogue:
 
     def __init__(self, pool: ShapeLibrary, copies: float, seed: int, rng: np.random.Generator) -> None:
         self.pool, self.copies, self.seed, self.rng = pool, copies, seed, rng
-        self.looks: dict[str, list[Look]] = {}
+        self.looks: dict[str, list[Appearance]] = {}
         self.count = 0
 
-    def pick(self, category: str, longest: float = np.inf) -> Look:
+    def pick(self, category: str, longest: float = np.inf) -> Appearance:
         """A look of a category with a box diagonal of at most `longest` m (the smallest found, if none is)."""
         known = [look for look in self.looks.get(category, []) if look.item.shape.diagonal <= longest]
         if known and self.rng.random() < self.copies:
@@ -73,7 +73,7 @@ class Catalogue:
             if drawn[-1].shape.diagonal <= longest:
                 break
         item = min(drawn, key=lambda thing: thing.shape.diagonal) if drawn[-1].shape.diagonal > longest else drawn[-1]
-        look = Look(item, int(np.random.default_rng([self.seed, self.count, 77]).integers(2**31)))
+        look = Appearance(item, int(np.random.default_rng([self.seed, self.count, 77]).integers(2**31)))
         self.count += 1
         self.looks.setdefault(category, []).append(look)
         return look

@@ -25,8 +25,7 @@ from nolbo_ppl.io.images import open_image
 from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
-from nolbo_ppl.parallel import parallel
-from nolbo_ppl.progress import progress_bar
+from nolbo_ppl.synthetic.dataset_writer import write_missing
 from nolbo_ppl.synthetic.worlds.world import World, make_world
 from nolbo_ppl.synthetic.worlds.world_config import SequenceConfig
 from nolbo_ppl.synthetic.worlds.world_frame import render_frame
@@ -130,10 +129,9 @@ def _write(config: SequenceConfig, out: Path, workers: int) -> SequenceSummary:
         raise input_error("the folder is not empty", got=out, expected="a new folder", do="choose another --out")
     if not (out / SCENES).is_file():
         world = _world(config)
-        (out / "images").mkdir(parents=True, exist_ok=True)
         write_json(known, {**made, "version": __version__, **_facts(world)})
         _write_ground_truth(world, out)
-        _render_missing(config, out, workers)
+        write_missing(_write_chunk, config, out, config.frames, CHUNK, workers, "frame")
         rows = [row for first in range(0, config.frames, CHUNK) for _, row in read_jsonl(out / ".parts" / f"{first:06d}.jsonl")]
         write_jsonl(out / SCENES, rows)
         shutil.rmtree(out / ".parts")
@@ -160,16 +158,6 @@ def _write_ground_truth(world: World, out: Path) -> None:
     write_json(out / OBJECTS, [describe_object(world, k) for k in range(len(world.objects))])
     items = {thing.look.item.shape.instance: thing.look.item for thing in world.objects}
     save_npz(out / VOXELS, {name: item.voxels for name, item in sorted(items.items())})
-
-
-def _render_missing(config: SequenceConfig, out: Path, workers: int) -> None:
-    chunks = [(first, min(first + CHUNK, config.frames)) for first in range(0, config.frames, CHUNK)]
-    missing = [chunk for chunk in chunks if not (out / ".parts" / f"{chunk[0]:06d}.jsonl").is_file()]
-    jobs = [(_write_chunk, (config, out, first, last)) for first, last in missing]
-    done = config.frames - sum(last - first for first, last in missing)
-    with progress_bar(None, "rendering the drive", "frame", total=config.frames, done=done) as bar:
-        for number in parallel(jobs, min(workers, len(jobs))):
-            bar.update(number)
 
 
 def _summary(out: Path) -> SequenceSummary:
