@@ -64,7 +64,7 @@ class EvaluateConfig:
     """Number of the first photograph and step to the next: with `1 3` the second, the fifth, ... are measured."""
     peer: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
     """ONNX file of a detector (YOLOX or PicoDet, COCO's categories) to measure on the same photographs; may be given several
-    times (extra `detector`)."""
+    times (extra `onnx`)."""
     count: int = 500
     """Scenes to generate, or at most to read; of photographs, all are read unless a smaller number is given."""
     seed: int = SEED

@@ -50,7 +50,7 @@ class OnnxPeer:
         try:
             import onnxruntime
         except ImportError:
-            raise input_error("a peer", got="no package `onnxruntime`", do="pip install 'nolbo-ppl[detector]'") from None
+            raise input_error("a peer", got="no package `onnxruntime`", do="pip install 'nolbo-ppl[onnx]'") from None
         if not Path(path).is_file():
             raise input_error("a peer", got="no such file", expected="an ONNX file", file=path)
         options = onnxruntime.SessionOptions()

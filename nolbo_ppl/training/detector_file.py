@@ -1,4 +1,4 @@
-"""Read the public ONNX file of YOLOX-nano into the guide's own module; needs the extra `detector` (`onnx`)."""
+"""Read the public ONNX file of YOLOX-nano into the guide's own module; needs the extra `onnx`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_detector(path: str | os.PathLike[str]) -> YoloxNano:
         import onnx
         from onnx import numpy_helper
     except ImportError:
-        raise input_error("detector file", got="no package `onnx`", do="pip install 'nolbo-ppl[detector]'") from None
+        raise input_error("detector file", got="no package `onnx`", do="pip install 'nolbo-ppl[onnx]'") from None
     try:
         graph = onnx.load(os.fspath(path)).graph
     except (OSError, ValueError, onnx.onnx_cpp2py_export.checker.ValidationError) as error:

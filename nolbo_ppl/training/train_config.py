@@ -74,7 +74,7 @@ class TrainConfig:
     preset: Literal["nano", "tiny", "photo", "paper"] = "tiny"
     """Networks: `tiny` for CPUs, `photo` for photographs, `paper` for darknet19 and 64^3 voxels, `nano` for demonstrations."""
     detector: Path | None = None
-    """ONNX file of YOLOX-nano, whose predictions the preset `photo` starts from (extra `detector`); not needed with the
+    """ONNX file of YOLOX-nano, whose predictions the preset `photo` starts from (extra `onnx`); not needed with the
     weights of such a preset as `initial`."""
     objective: Literal["inclusive", "elbo", "paper"] = "inclusive"
     """What is maximised: the inclusive objective, the pure bound, or the paper's (the bound with objectness turned)."""
