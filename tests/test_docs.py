@@ -172,6 +172,22 @@ def test_links_between_documents_lead_somewhere() -> None:
                 assert (page.parent / target.split("#")[0]).exists(), f"{page.name}: {target}"
 
 
+def test_modules_that_the_documents_name_are_there() -> None:
+    named = set()
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        named |= {(page.name, name) for name in re.findall(r"`(nolbo_ppl(?:\.\w+)+)", text)}
+    assert named
+    for page_name, name in sorted(named):
+        parts, found = name.split("."), ROOT
+        while parts and (found / parts[0]).is_dir():
+            found /= parts.pop(0)
+        module = found / f"{parts[0]}.py" if parts else found / "__init__.py"
+        source = module if module.is_file() else found / "__init__.py"  # else a name that the package itself holds
+        left = parts[1:] if module.is_file() else parts
+        assert all(part in source.read_text(encoding="utf-8") for part in left[:1]), f"{page_name}: {name}"
+
+
 @pytest.mark.slow
 def test_own_categories_train_as_the_how_to_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Command lines and configuration of docs/howto/own-categories.md, with the folder of docs/howto/own-data.md."""
