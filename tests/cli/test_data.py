@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from nolbo_ppl.cli import main
 from nolbo_ppl.cli.data import check_data
@@ -17,6 +17,7 @@ from nolbo_ppl.data.format_registry import FORMATS, FormatReport, recognise, reg
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.observations import write_observations
 from nolbo_ppl.structures.detections import Detections
+from nolbo_ppl.viz.style import category_colour
 
 
 def text(path: Path, content: str) -> Path:
@@ -179,7 +180,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     main(["data", "check", str(folder), "--out", str(sheet)])
     assert "labelled scenes [scenes]" in capsys.readouterr().out
     colours = np.asarray(Image.open(sheet)).reshape(-1, 3)
-    assert Image.open(sheet).size == (640, 254) and (colours == (230, 75, 53)).all(axis=1).sum() > 300  # the boxes
+    drawn = (colours == ImageColor.getrgb(category_colour("car"))).all(axis=1)
+    assert Image.open(sheet).size == (640, 254) and drawn.sum() > 300  # the boxes
     main(["data", "check", "scenes", str(folder), "--json"])
     assert json.loads(capsys.readouterr().out)["objects"] == 2
     with pytest.raises(SystemExit) as end:
