@@ -117,6 +117,15 @@ def test_file_names_stand_once() -> None:
     assert not {name: places for name, places in counts.items() if len(places) > 1}
 
 
+def test_class_names_stand_once() -> None:
+    places: dict[str, list[str]] = {}
+    for path in modules():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
+    assert not {name: where for name, where in places.items() if len(where) > 1}
+
+
 def test_no_room_holds_more_than_a_quarter_of_the_code() -> None:
     lines: dict[str, int] = {}
     for path in modules():
