@@ -72,6 +72,36 @@ def test_the_example_of_a_public_name_runs(name: str, tmp_path: Path, monkeypatc
     assert runner.summarize(verbose=False).failed == 0, "".join(told)
 
 
+def internals_with_examples() -> list[str]:
+    """Functions and classes outside of the public interface whose docstrings hold an example, as `module:name`."""
+    package, found = Path(nolbo_ppl.__file__).parent, []
+    for path in sorted(package.rglob("*.py")):
+        module = ".".join(path.relative_to(package).with_suffix("").parts)
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and f"{module}:{node.name}" not in nolbo_ppl.PUBLIC.values():
+                texts = [ast.get_docstring(x) for x in ast.walk(node) if isinstance(x, ast.FunctionDef | ast.ClassDef)]
+                if any(text and ">>>" in text for text in texts):
+                    found.append(f"{module}:{node.name}")
+    return found
+
+
+@pytest.mark.usefixtures("single_precision")
+@pytest.mark.parametrize("place", internals_with_examples())
+def test_the_example_of_an_internal_runs(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    module = importlib.import_module("nolbo_ppl." + place.partition(":")[0])
+    name = place.partition(":")[2]
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE | doctest.IGNORE_EXCEPTION_DETAIL
+    runner = doctest.DocTestRunner(optionflags=flags, verbose=False)
+    tests = doctest.DocTestFinder().find(getattr(module, name), name, module, globs={**vars(module), "np": np})
+    told: list[str] = []
+    for test in tests:
+        runner.run(test, out=told.append)
+    results = runner.summarize(verbose=False)
+    assert results.attempted and not results.failed, "".join(told)
+
+
 @pytest.mark.parametrize(
     ("program", "seconds"), [("import nolbo_ppl", 0.2), ("from nolbo_ppl.cli import main; main(['--help'])", 0.5)]
 )

@@ -20,7 +20,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.alignment import align, principal_plane
 from nolbo_ppl.io.camera_files import CameraIntrinsics, write_camera
 from nolbo_ppl.io.fields import number_array
-from nolbo_ppl.io.files import inside, read_json, read_json_object, read_jsonl, write_json, write_jsonl
+from nolbo_ppl.io.files import inside, read_json_object, read_jsonl, write_json, write_jsonl
 from nolbo_ppl.io.landmark_views import LandmarkViews, read_views
 from nolbo_ppl.io.landmarks import (
     Iterations,
@@ -35,6 +35,7 @@ from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.io.observations import read_observations, write_observations
 from nolbo_ppl.io.output_folder import settle
 from nolbo_ppl.io.trajectories import Trajectory, covariance_beside, read_frame_poses, read_trajectory, write_trajectory
+from nolbo_ppl.io.true_objects import trusted_objects
 from nolbo_ppl.structures.association_table import AssociationTable
 from nolbo_ppl.structures.detections import Detections
 from nolbo_ppl.structures.landmark import Landmark
@@ -289,20 +290,9 @@ class RunFolder:
 
     @cached_property
     def objects(self) -> dict[str, str | None] | None:
-        """True object of each detection by its id, None for clutter; others are not known. None when nobody said anything.
-
-        As converters and runs write `objects.json`, without the rows whose truth is not trusted; other files of that name say
-        nothing.
-        """
+        """True object of each detection by its id (`trusted_objects`); None when nobody said anything."""
         path = self.path / "objects.json"
-        value = read_json(path) if path.is_file() else None
-        value = value if isinstance(value, dict) else {}
-        found = value.get("objects")
-        if not isinstance(found, dict):
-            return None
-        trusted = value.get("trusted")
-        kept = trusted if isinstance(trusted, list) and len(trusted) == len(found) else [True] * len(found)
-        return {str(k): None if v is None else str(v) for (k, v), keep in zip(found.items(), kept) if keep}
+        return trusted_objects(path) if path.is_file() else None
 
     def write_objects(self, objects: Mapping[str, str | None]) -> None:
         """Write `objects.json`: the true object of each detection by its id, None for none."""

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import is_rotation
 from nolbo_ppl.io.fields import number_array
-from nolbo_ppl.io.files import existing_file, read_json_object
+from nolbo_ppl.io.files import existing_file, read_json, read_json_object
 
 CLUTTER, UNKNOWN = -1, -2
 """In place of an object's number: a detection of nothing, and one of which nobody says what it is of."""
@@ -75,3 +75,20 @@ def read_true_objects(path: str | PathLike[str], ids: Sequence[str]) -> TrueObje
                 latent[number[name]] = x
     category = tuple(categories.get(name) if isinstance(categories.get(name), str) else None for name in names)
     return TrueObjects(np.array(of, dtype=np.int64), T, category, latent)
+
+
+def trusted_objects(path: str | PathLike[str]) -> dict[str, str | None] | None:
+    """True object of each detection by its id, None for clutter, without the rows whose truth is not trusted.
+
+    As converters and runs write `objects.json`; None for other files of that name, which say nothing of detections.
+
+    Raises:
+        InputError: no such file, or no JSON.
+    """
+    value = read_json(path)
+    found = value.get("objects") if isinstance(value, dict) else None
+    if not isinstance(found, dict):
+        return None
+    trusted = value.get("trusted")
+    kept = trusted if isinstance(trusted, list) and len(trusted) == len(found) else [True] * len(found)
+    return {str(name): None if of is None else str(of) for (name, of), keep in zip(found.items(), kept) if keep}
