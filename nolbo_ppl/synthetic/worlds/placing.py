@@ -116,7 +116,7 @@ class Placer:
         facing: float,
         *,
         longest: float = np.inf,
-        look: Look | None = None,
+        look: Appearance | None = None,
         floor: float = 0.0,
         on: WorldObject | None = None,
     ) -> WorldObject | None:

@@ -17,7 +17,7 @@ from nolbo_ppl.synthetic.scenes.environment import sample_light
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig
 from nolbo_ppl.synthetic.worlds.camera_path import Loop, Wobble, camera_poses, drive_track, random_loop
 from nolbo_ppl.synthetic.worlds.indoor import build_indoor
-from nolbo_ppl.synthetic.worlds.placing import Catalogue, Look, Placer, WorldObject
+from nolbo_ppl.synthetic.worlds.placing import Appearance, Catalogue, Placer, WorldObject
 from nolbo_ppl.synthetic.worlds.street import build_street
 from nolbo_ppl.synthetic.worlds.street_ground import LANE
 from nolbo_ppl.synthetic.worlds.world_config import SequenceConfig
@@ -79,7 +79,7 @@ class World:
         return _riding(self.loop, start + speed * frame, lateral, thing.look)
 
 
-def _riding(loop: Loop, s: float, lateral: float, look: Look) -> Float[np.ndarray, "4 4"]:
+def _riding(loop: Loop, s: float, lateral: float, look: Appearance) -> Float[np.ndarray, "4 4"]:
     """Pose in the ground frame of an object that drives against the camera's direction."""
     point, heading = loop.at(s, lateral)
     z = 0.5 * float(look.item.shape.dimensions[2])
