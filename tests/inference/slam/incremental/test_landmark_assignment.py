@@ -51,7 +51,7 @@ def test_an_object_met_again_is_its_landmark_and_another_one_is_new() -> None:
 
 
 def test_background_founds_nothing() -> None:
-    slam = IncrementalSlam(replace(CONFIG, objectness_prior=0.5))
+    slam = IncrementalSlam(replace(CONFIG, objectness_prior=0.5, birth_intensity=1e-4, clutter_intensity=1e-2))
     table = Detections.from_arrays(np.zeros(1, int), np.array([CHAIR]), objectness=0.02)
     for _ in range(4):
         assert slam.update(np.eye(4), table).landmarks == 0
