@@ -1,8 +1,11 @@
 """Tails of the positions and the largest certainty of a model, fitted on scenes that nothing else was fitted on.
 
     OMP_NUM_THREADS=1 python benchmarks/observation_tails.py [--model tiny] [--scenes 200] [--seeds 8801] [--write]
+    OMP_NUM_THREADS=1 python benchmarks/observation_tails.py --model photo --photographs val.json --write
 
-Half of the scenes are standard, half full. With `--write` both numbers go into the model's config.json.
+Half of the scenes are standard, half full. Positions are known in scenes alone; with `--photographs` the largest certainty is
+that of labelled photographs, every third from the first (`nolbo evaluate --part 1 3` measures every third from the second). With
+`--write` both numbers go into the model's config.json.
 """
 
 from __future__ import annotations
@@ -17,12 +20,14 @@ import tyro
 
 import nolbo_ppl
 from nolbo_ppl.cli.evaluate import EvaluateConfig, Evaluation, measure, open_scenes
-from nolbo_ppl.evaluation.scores import judged
+from nolbo_ppl.evaluation.photograph_run import evaluate_photographs
+from nolbo_ppl.evaluation.scores import MIN_OBJECTNESS, judged
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.models.posterior_calibration import CERTAIN
 from nolbo_ppl.training.calibrate_answers import calibrate_answers
+from nolbo_ppl.training.photograph_fit import PARTS
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,8 @@ class Arguments:
     """Scenes of each of the two difficulties."""
     seeds: tuple[int, ...] = (8801,)
     """Their seeds; so many scenes of each."""
+    photographs: Path | None = None
+    """Labelled photographs (COCO-style JSON), for the largest certainty."""
     write: bool = False
     """Write the two numbers into the model's folder."""
 
@@ -64,6 +71,11 @@ def main(arguments: Arguments) -> None:
     squared = squared[np.isfinite(squared)]
     detections = [one.detections.all.select(judged(one.detections.all)) for one in found]
     score, right = (np.concatenate([getattr(d, name) for d in detections]) for name in ("score", "correct"))
+    if arguments.photographs is not None:
+        fitted_on = ObservationModel(model.model, plain)
+        pooled = evaluate_photographs(arguments.photographs, fitted_on, part=(0, PARTS), resamples=10).scores.pooled
+        pooled = pooled.select(~pooled.ignored & (pooled.score >= MIN_OBJECTNESS))
+        score, right = pooled.score, pooled.correct
     fitted = calibrate_answers(plain, squared, score, right)
     sure = score > 0.99
     print(

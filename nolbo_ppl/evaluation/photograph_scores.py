@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.data.converters.photographs import Photograph
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.evaluation.calibration_scores import perfect_error
 from nolbo_ppl.evaluation.scores import MIN_OBJECTNESS
 from nolbo_ppl.metrics.calibration import expected_calibration_error
 from nolbo_ppl.metrics.detection import Matches, average_precision, match
@@ -161,6 +162,8 @@ def photograph_scores(
         "ece_class": estimate(
             lambda w: expected_calibration_error(confidence, right > 0, w[:, scene]), weights, len(right), pivotal=True
         ),
+        "ece_objectness_if_perfect": perfect_error(score, rng),
+        "ece_class_if_perfect": perfect_error(confidence, rng),
         "false_without_objects": estimate(lambda w: weighted_mean(false[rows], w[:, rows]), weights, len(rows)),
     }
     if viewpoints is not None and len(viewpoints.error):

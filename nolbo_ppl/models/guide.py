@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from nolbo_ppl.devices import mixed_precision
 from nolbo_ppl.geometry.boxes import box_iou
 from nolbo_ppl.models.backbones import check_image, make_encoder, normalise_image
+from nolbo_ppl.models.crops import image_levels
 from nolbo_ppl.models.distributions import (
     NoisyNormal,
     ViewpointMixture,
@@ -29,6 +30,7 @@ from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParam
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.pyro_parameters import declare_parameters
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_centre, cell_of, decode_box, encode_box, encode_range
+from nolbo_ppl.models.shape_look import ShapeLook
 
 
 def orientation_posterior(parameters: RegionParameters, config: ModelConfig) -> dist.TorchDistribution:
@@ -70,6 +72,7 @@ class Guide(nn.Module):
         self.config = config
         self.encoder = make_encoder(config)
         self.head = RegionHead(self.encoder.channels, config, self.encoder.fine_channels, self.encoder.fine_strides)
+        self.shape_look = ShapeLook(sum(self.head.sizes), config) if config.shape_look else None
         self._shared = (prior,)  # the generative model's own: a tuple, so that it is no module of the guide's state
         self.half_precision = False
         """Run encoder and head in bfloat16, everything after them in the weights' own precision."""
@@ -92,7 +95,8 @@ class Guide(nn.Module):
             maps, fine = self.encoder(x)
             features = maps.flatten(2).transpose(1, 2)
             logit = self.head.objectness(features).flatten(1)
-        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine)
+        levels = () if self.shape_look is None else image_levels(x)
+        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine, levels=levels)
 
     def parameters_at(
         self,
@@ -117,7 +121,28 @@ class Guide(nn.Module):
             raw = raw.to(self.head.objectness.weight.dtype)
             if look:
                 raw = self.head.refine(raw, encoding.fine, row, cell, encoding.columns, box)
+        if look and self.shape_look is not None:
+            own = decode_box(self.head.box_latent(raw), cell, encoding.columns, self.config) if box is None else box
+            raw = self.look_at_shapes(raw, encoding, row, own)
         return self.head.parameters_of(raw, self._prior().label_mean())
+
+    def look_at_shapes(
+        self, raw: Float[Tensor, "n outputs"], encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
+    ) -> Float[Tensor, "n outputs"]:
+        """Raw outputs with what the look at shapes adds to the shape latent; as they are in guides without one.
+
+        Args:
+            raw: outputs so far.
+            encoding: the encoded images.
+            row: the image of each object.
+            box: where it is cut out, px.
+        """
+        if self.shape_look is None or len(row) == 0:
+            return raw
+        with self._autocast():
+            change = self.shape_look(encoding.levels, row, box, raw).to(raw.dtype)
+        before = self.head.sizes[0]
+        return raw + nn.functional.pad(change, (before, raw.shape[-1] - before - change.shape[-1]))
 
     def _raw(self, encoding: Encoding, cell: Int[Tensor, "b m"]) -> Float[Tensor, "b m predictors outputs"]:
         index = cell[..., None].expand(-1, -1, encoding.features.shape[-1])
@@ -172,8 +197,11 @@ class Guide(nn.Module):
         row, slot = assigned.nonzero(as_tuple=True)
         with self._autocast():
             refined = self.head.refine(raw[row, slot], encoding.fine, row, cell[row, slot], encoding.columns)
-        raw = raw.index_put((row, slot), refined.to(raw.dtype))
-        return self.head.parameters_of(raw, self._prior().label_mean())
+        refined = refined.to(raw.dtype)
+        if self.shape_look is not None:
+            box = decode_box(self.head.box_latent(refined).detach(), cell[row, slot], encoding.columns, self.config)
+            refined = self.look_at_shapes(refined, encoding, row, box)
+        return self.head.parameters_of(raw.index_put((row, slot), refined), self._prior().label_mean())
 
     def responsible_region(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
         """Region responsible for each given box: in its cell the predictor whose own box overlaps it most (NOLBO,

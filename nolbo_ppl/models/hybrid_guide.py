@@ -42,8 +42,6 @@ class HybridEncoding(Encoding):
     """The evidence about every region."""
     box: Float[Tensor, "b k 4"] | None = None
     """Box of every region, px."""
-    levels: tuple[Float[Tensor, "b 3 _ _"], ...] = ()
-    """The normalised images at falling sizes, which objects are cut out of."""
 
 
 @dataclass
@@ -59,7 +57,7 @@ class GatheredEvidence:
     rows: int
     columns: int
     levels: tuple[Float[Tensor, "b 3 _ _"], ...]
-    """See `HybridEncoding`."""
+    """See `Encoding`."""
 
 
 class HybridGuide(Guide):
@@ -126,7 +124,7 @@ class HybridGuide(Guide):
         with torch.no_grad():
             shift, generated = self.shift(one.context), self.fusion.generated(one.context)
         logit = fused.objectness_logit
-        return HybridEncoding(one.features, logit, one.rows, one.columns, (), shift, generated, fused, box, one.levels)
+        return HybridEncoding(one.features, logit, one.rows, one.columns, (), shift, generated, one.levels, fused=fused, box=box)
 
     def parameters_at(
         self,
@@ -159,11 +157,13 @@ class HybridGuide(Guide):
         if not look or len(row) == 0:
             start = self.head.get_buffer("start")[-1].to(dtype).expand(len(row), -1)
             return torch.cat((labels, start[:, label_size:first], located, start[:, first + box_size :]), -1)
-        raw, factor = self.look_at(encoding.levels, row, encoding.box[row, region] if box is None else box)
+        place = encoding.box[row, region] if box is None else box
+        raw, factor = self.look_at(encoding.levels, row, place)
         shift = range_shift(factor, self.config.range_spread[0])
         ranges = torch.cat((raw[:, first + box_size :][:, :1] + shift[:, None], raw[:, first + box_size + 1 :]), -1)
         seen = fused.look_weight[row, region][:, None] * torch.log_softmax(raw[:, :label_size], -1)
-        return torch.cat((labels + seen, raw[:, label_size:first], located, ranges), -1)
+        answer = torch.cat((labels + seen, raw[:, label_size:first], located, ranges), -1)
+        return self.look_at_shapes(answer, encoding, row, place)
 
     def look_at(
         self, levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]

@@ -16,6 +16,7 @@ LARGEST = 8192
 LARGEST_OF = {
     **dict.fromkeys(("encoder_blocks", "glimpse_blocks", "glimpse", "predictors", "azimuth_components"), 64),
     **dict.fromkeys(("symmetry", "instance_category"), 100_000),
+    "shape_look": 512,
 }
 """The same of single fields: blocks are modules of their own."""
 
@@ -53,6 +54,9 @@ class ModelConfig:
     """Residual blocks of the second look."""
     glimpse_detail: bool = False
     """The second look samples the finest map twice as densely too."""
+    shape_look: int = 0
+    """Side, px, of a crop of each object that an encoder of its own looks at for the shape latent alone, a multiple of 16
+    (`nolbo_ppl.models.shape_look`; tiny encoder only); 0 for none."""
     predictors: int = 2
     """Predictors P of each cell; a scene of G x G cells has K = G G P regions."""
     image_size: int = 128
@@ -152,6 +156,11 @@ class ModelConfig:
                 got=f"encoder {self.encoder}, glimpse {self.glimpse}",
                 expected="the tiny encoder with a second look, no instance labels",
             )
+        if self.shape_look < 0 or self.shape_look % 16:
+            raise input_error("shape_look", got=self.shape_look, expected="a multiple of 16, or 0")
+        if self.shape_look and (self.encoder != "tiny" or self.instances or self.method != "nolbo"):
+            got = f"encoder {self.encoder}, {len(self.instances)} instances, method {self.method}"
+            raise input_error("a look at shapes", got=got, expected="the tiny encoder, no instance labels, method nolbo")
         if self.image_size % 32 or self.image_size <= 0:
             raise input_error("image_size", got=self.image_size, expected="a positive multiple of 32")
         for name in ("decoder_channels", "voxel_encoder_channels"):

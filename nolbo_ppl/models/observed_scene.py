@@ -32,6 +32,8 @@ class Encoding:
     """How unlike the images learnt from each is (`nolbo_ppl.models.image_shift`); None where the guide cannot tell."""
     generated: Float[Tensor, " b"] | None = None
     """Probability that each is a generated scene; None where the guide cannot tell."""
+    levels: tuple[Float[Tensor, "b 3 _ _"], ...] = ()
+    """The normalised images at falling sizes, for looks at objects cut out of them; empty where the guide takes none."""
 
 
 @dataclass

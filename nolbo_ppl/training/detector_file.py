@@ -51,13 +51,20 @@ def read_detector(path: str | os.PathLike[str]) -> YoloxNano:
     return model.eval()
 
 
+LOOK = "guide.shape_look."
+"""What the names of weights of a look at shapes begin with."""
+
+
 def adopt(model: Nolbo, initial: Nolbo, detector: str | os.PathLike[str] | None) -> None:
-    """Give a model the weights of another one, and those of a detector that the other has not.
+    """Give a model the weights of another one, and those of a detector or of a look at shapes that the other has not.
 
     Raises:
         InputError: the model has a detector, the other has none, and no file is given; or the file cannot be used.
     """
     state = initial.state_dict()
+    if model.config.shape_look and not initial.config.shape_look:  # its encoder starts from the guide's
+        own = {f"{LOOK}encoder.{name}": value for name, value in initial.guide.encoder.state_dict().items()}
+        state |= {name: value for name, value in model.state_dict().items() if name.startswith(LOOK)} | own
     if model.config.detector and not initial.config.detector:
         if detector is None:
             raise input_error("the preset photo without a detector", do="give --detector yolox_nano.onnx")

@@ -43,6 +43,8 @@ class TrainingStage:
     """Steps, from the first, during which decoder and prior networks stay as they are (normalisation included)."""
     freeze_encoder: bool = False
     """The image encoder stays as it is (normalisation included)."""
+    shape_look_alone: bool = False
+    """The guide stays as it is, but for its look at shapes."""
     decode: int = 0
     """Objects decoded a step; their voxel term stands for all objects. 0 where voxels have no weight, and for all
     shapes in the stage of shapes."""
@@ -88,6 +90,9 @@ class StageRun:
                 model.story.requires_grad_(False)
             if stage.freeze_encoder:
                 model.guide.encoder.requires_grad_(False)
+            if stage.shape_look_alone:
+                model.guide.requires_grad_(False)
+                model.guide.get_submodule("shape_look").requires_grad_(True)
             rebuilt = weights.pop("voxels", 0.0) if joint else 0.0
             module = SceneLoss(model.story, model.guide, SceneELBO(weights))
             if joint:
@@ -113,6 +118,9 @@ class StageRun:
                     parameter.requires_grad_(not frozen)
                 if self.stage.freeze_encoder:
                     self.model.guide.encoder.eval()
+                if self.stage.shape_look_alone:
+                    self.model.guide.eval()
+                    self.model.guide.get_submodule("shape_look").train()
             self._frozen = frozen
         return frozen
 

@@ -38,7 +38,15 @@ FREE_FIELDS = (
     "prefetch",
 )
 """Fields a resumed run may change: they do not touch what is learnt."""
-NEW_FIELDS = {"method": "nolbo", "initial_part": "all", "freeze_encoder": False, "joint": 0.25, "shape_decode": 0}
+NEW_FIELDS = {
+    "method": "nolbo",
+    "initial_part": "all",
+    "freeze_encoder": False,
+    "joint": 0.25,
+    "shape_decode": 0,
+    "shape_look": 0,
+    "learn": "all",
+}
 """Fields that a checkpoint need not name where they have these values, for the same reason as `OPTIONAL_FIELDS`."""
 OPTIONAL_FIELDS = (
     "categories",
@@ -55,6 +63,8 @@ OPTIONAL_FIELDS = (
 """Fields that a checkpoint need not name where they are empty: checkpoints are older than they are."""
 
 
+SHAPE_TERMS = ("shape_kl", "shape_inclusive", "voxels")
+"""Terms that a look at shapes learns from."""
 LARGEST_RATE = 10.0
 """Learning rates above throw every weight away at the first step."""
 
@@ -124,6 +134,11 @@ class TrainConfig:
     for networks of the preset whose heads, latent and prior start afresh."""
     freeze_encoder: bool = False
     """The image encoder stays as it is: a quarter of the time a step, for comparing what is built on one encoder."""
+    shape_look: int = 0
+    """Give the networks a look of its own at shapes: side of its crops, px, a multiple of 16
+    (`nolbo_ppl.models.shape_look`). That of the initial weights by default."""
+    learn: Literal["all", "shape_look"] = "all"
+    """What is learnt of the guide: everything, or its look at shapes alone, all else of the initial weights as it is."""
     grow: bool = False
     """Grow the initial networks to the blocks and the second look of the preset (`nolbo_ppl.training.net2net`)."""
     cache: Path = DEFAULT_CACHE
@@ -217,6 +232,12 @@ class TrainConfig:
                 "initial_part",
                 got=f"initial {self.initial}, grow {self.grow}, preset {self.preset}",
                 expected="--initial, neither --grow nor the preset photo",
+            )
+        if self.learn != "all" and (self.initial is None or self.shape_steps or self.initial_part != "all" or self.grow):
+            raise input_error(
+                f"learn {self.learn}",
+                got=f"initial {self.initial}, {self.shape_steps} steps of shapes, part {self.initial_part}, grow {self.grow}",
+                expected="all of some --initial weights as they are, and --shape-steps 0",
             )
         if self.detector is not None and self.preset != "photo":
             raise input_error("a detector", got=f"preset {self.preset}", do="add --preset photo")
@@ -319,10 +340,16 @@ class TrainConfig:
                 )
             if self.preset == "photo" and not config.detector:
                 config = dataclasses.replace(config, detector="yolox_nano", image_size=PRESETS["photo"]().image_size)
+            if self.shape_look:
+                if config.shape_look not in (0, self.shape_look):
+                    raise input_error("shape_look", got=self.shape_look, expected=f"{config.shape_look}, as the initial weights")
+                config = dataclasses.replace(config, shape_look=self.shape_look)
+            if self.learn == "shape_look" and not config.shape_look:
+                raise input_error("learn shape_look", got="weights without such a look", do="add --shape-look 96")
             if self.grow:
                 config = grown_config(config, PRESETS[self.preset]())
             return config if self.image_size is None else dataclasses.replace(config, image_size=self.image_size)
-        changes: dict[str, Any] = {"method": self.method}
+        changes: dict[str, Any] = {"method": self.method, "shape_look": self.shape_look}
         if self.categories:
             changes["categories"], changes["symmetry"] = self.categories, self._symmetry()
         if self.image_size is not None:
@@ -346,6 +373,8 @@ class TrainConfig:
     def stages(self) -> list[TrainingStage]:
         """The stages that have steps."""
         weights = scene_weights(self.objective, self.weights, self.method)
+        if self.learn == "shape_look":
+            weights = {name: weight for name, weight in weights.items() if name in SHAPE_TERMS}
         decoded = METHODS[self.method].decoded  # the decoder learns along
         images = OptimizerConfig(learning_rate=self.learning_rate, optimizer=self.optimizer)
         joint = self.joint_steps
@@ -363,14 +392,16 @@ class TrainConfig:
                 weights,
                 freeze=0 if decoded else self.single_steps,
                 freeze_encoder=self.freeze_encoder,
+                shape_look_alone=self.learn == "shape_look",
                 decode=self.decode if decoded else 0,
             ),
             TrainingStage(
                 "scenes",
                 dataclasses.replace(images, steps=alone, warmup=min(100, alone)),
                 weights,
-                freeze=0 if decoded else round(self.freeze * alone),
+                freeze=0 if decoded else alone if self.learn == "shape_look" else round(self.freeze * alone),
                 freeze_encoder=self.freeze_encoder,
+                shape_look_alone=self.learn == "shape_look",
                 decode=self.decode if weights.get("voxels") else 0,
             ),
             TrainingStage(

@@ -83,8 +83,10 @@ def _run(config: TrainConfig, rank: int, world: int, device: torch.device) -> Tr
         torch.set_num_threads(config.threads)
     data = TrainingData(config, rank, world, device)
     model = Nolbo.from_seed(data.model, config.seed)
+    given = Calibration()
     if config.start is not None:
-        initial = load(config.start, "cpu").model
+        loaded = load(config.start, "cpu")
+        initial, given = loaded.model, loaded.calibration
         if config.grow:
             initial = grow(initial, model.config, config.seed)
         if config.initial_part == "features":
@@ -118,8 +120,9 @@ def _run(config: TrainConfig, rank: int, world: int, device: torch.device) -> Tr
     )
     if rank == 0:
         model.set_half_precision(False)
-        weighed = weigh_evidence(model, data, config) if model.config.detector else {}
-        photographs = fit_photographs(model, config) if model.config.detector else {}
+        detects = bool(model.config.detector) and config.learn == "all"
+        weighed = weigh_evidence(model, data, config) if detects else {}
+        photographs = fit_photographs(model, config) if detects else {}
         calibration = Calibration()
         if any(stage.name != "shapes" for stage in stages):
             data.encode_shapes(model)
@@ -128,6 +131,9 @@ def _run(config: TrainConfig, rank: int, world: int, device: torch.device) -> Tr
                 calibration = calibrate(model, data.validation(None))
             if photographs:  # fitted within the evidence, for photographs and generated scenes apart
                 calibration = replace(calibration, objectness_slope=1.0, objectness_shift=0.0, label_slope=1.0)
+            if config.learn == "shape_look":  # all other answers are those of the initial weights
+                shapes = {name: getattr(calibration, name) for name in ("shape_scale", "shape_correlation")}
+                calibration = replace(given, **shapes) if calibration != Calibration() else given
         summary.seconds = time.perf_counter() - started
         meta = {
             "calibrated": calibration != Calibration(),

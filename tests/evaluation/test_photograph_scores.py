@@ -63,6 +63,16 @@ def test_false_detections_and_calibration_by_hand() -> None:
     assert scores.by_size["small (24-64 px)"]["objects"] == 1
 
 
+def test_the_error_that_noise_alone_leaves() -> None:
+    """Three detections at one half: a perfect forecaster is off by 1/2 in a quarter of cases, by 1/6 in the others."""
+    photos = [photo([CAR], [0], {0, 1})]
+    answers = [answer([CAR, FREE, OTHER], [0.5, 0.5, 0.5], [0, 0, 0], sure=1.0)]
+    figures = photograph_scores(photos, answers, NAMES, np.random.default_rng(0), 50).figures
+    null = figures["ece_objectness_if_perfect"]
+    assert null.value == pytest.approx(0.25, abs=5 * np.sqrt(1 / 48 / 200))  # 200 draws of variance 1/12 - 1/16
+    assert null.count == 3 and figures["ece_class_if_perfect"].value == 0.0  # certain, and so never wrong
+
+
 def test_viewpoints_of_what_is_found() -> None:
     photos = [photo([CAR], [0], {0, 1})]
     views = Viewpoints(

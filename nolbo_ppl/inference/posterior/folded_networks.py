@@ -132,6 +132,10 @@ def folded_guide(guide: Guide, dtype: torch.dtype) -> Guide:
     fast = copy.copy(guide)
     fast._modules = dict(guide._modules)
     fast._modules["encoder"] = FoldedEncoder(guide.encoder, dtype)
+    if guide.shape_look is not None:
+        look = copy.copy(guide.shape_look)
+        look._modules = {**guide.shape_look._modules, "encoder": FoldedEncoder(guide.shape_look.encoder, dtype)}
+        fast._modules["shape_look"] = look
     if isinstance(guide, HybridGuide):
         fast._modules["detector"] = folded_detector(guide.detector)
     return fast

@@ -42,9 +42,12 @@ def picture(seed: int = 0) -> torch.Tensor:
     return torch.randint(0, 256, (2, 3, 64, 96), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
 
 
+@pytest.mark.parametrize("shape_look", [0, 32])
 @pytest.mark.parametrize("detector", ["", "yolox_nano"])
-def test_a_folded_guide_answers_as_its_own(detector: str) -> None:
-    guide = model_of(tiny_config(detector=detector)).guide
+def test_a_folded_guide_answers_as_its_own(detector: str, shape_look: int) -> None:
+    guide = model_of(tiny_config(detector=detector, shape_look=shape_look)).guide
+    if guide.shape_look is not None:
+        torch.nn.init.normal_(guide.shape_look.judge[-1].weight, std=0.3)
     fast = folded_guide(guide, torch.float32)
     region, row = torch.tensor([3, 8, 20]), torch.tensor([0, 1, 1])
     with torch.inference_mode():
