@@ -12,7 +12,7 @@ import numpy as np
 
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence
 from nolbo_ppl.data.sequences.opening import open_frames
-from nolbo_ppl.data.sequences.undistorted import guessed_camera, recorded_camera, without_distortion
+from nolbo_ppl.data.sequences.undistorted import guessed_camera, photographed_cameras, recorded_camera, without_distortion
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.posterior.model_folder import load
 from nolbo_ppl.inference.posterior.predictor import ObservationModel, guessed_intrinsics
@@ -38,7 +38,8 @@ class ObserveConfig:
     """Name of weights in the package (`photo` for photographs, `tiny` for generated scenes), or a folder with a model of your
     own."""
     intrinsics: tuple[float, float, float, float] | None = None
-    """fx fy cx cy in px of the images, the same for all; without them 60 degrees across are taken for granted."""
+    """fx fy cx cy in px of the images, the same for all; without them those of each photograph's EXIF data, and where there are
+    none 60 degrees across are taken for granted."""
     camera: Path | None = None
     """A file with the camera instead (see `nolbo run --intrinsics`), whose distortion is taken out of the images."""
     score_threshold: float = 0.3
@@ -93,12 +94,21 @@ def run(config: ObserveConfig) -> ObserveSummary:
         config = replace(config, intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy))
     if config.out.resolve() == config.images.resolve():
         raise input_error("pictures would be written over the images", got=config.out, do="choose another --out")
+    cameras: list[np.ndarray | None] = photographed_cameras(frames)
+    if config.intrinsics is not None:
+        cameras = [np.array(config.intrinsics)] * len(frames)
     names = [picture_name(frames.name(k)) for k in range(len(frames))] if config.pictures else []
     with output_folder(config.out, ("observations.jsonl", *names), is_own=is_result) as folder:
-        rows = list(_rows(config, frames, model, folder))
+        rows = list(_rows(config, frames, cameras, model, folder))
         write_jsonl(folder / "observations.jsonl", rows)
-    guessed = guessed_camera(frames.size)[1] if config.intrinsics is None else ""
-    return ObserveSummary(len(frames), len(rows), config.out / "observations.jsonl", guessed)
+    return ObserveSummary(len(frames), len(rows), config.out / "observations.jsonl", _remark(frames, cameras))
+
+
+def _remark(frames: FrameSequence, cameras: Sequence[np.ndarray | None]) -> str:
+    """What cameras that nobody gave mean for the positions."""
+    known = sum(camera is not None for camera in cameras)
+    told = f"{known} of {len(frames)} images tell their focal length (EXIF); of the others " if known else ""
+    return "" if known == len(frames) else told + guessed_camera(frames.size)[1]
 
 
 def picture_name(name: str) -> str:
@@ -111,26 +121,29 @@ def is_result(folder: Path) -> bool:
     return (folder / "observations.jsonl").is_file() and not (folder / "run.json").exists()
 
 
-def _rows(config: ObserveConfig, frames: FrameSequence, model: ObservationModel, folder: Path) -> Iterator[dict]:
-    observe = partial(
-        model.observe,
-        intrinsics=config.intrinsics,
-        threshold=config.score_threshold,
-        size=config.size,
-        batch=config.batch,
-        seed=config.seed,
-    )
+def _rows(
+    config: ObserveConfig, frames: FrameSequence, cameras: Sequence[np.ndarray | None], model: ObservationModel, folder: Path
+) -> Iterator[dict]:
+    answer = partial(model.observe, threshold=config.score_threshold, size=config.size, batch=config.batch, seed=config.seed)
+    ahead = iter(cameras)  # images are asked for in their order
+
+    def observe(images: Sequence[np.ndarray]) -> Sequence[ObjectPosteriors]:
+        found: Sequence[ObjectPosteriors] = answer(images, [next(ahead) for _ in images])
+        return found
+
     for k, image, observed in observe_images(observe, frames.image, len(frames), config.batch):
         yield from observed.to_records(k, frames.name(k))
         if config.pictures:
-            _draw(config, folder / picture_name(frames.name(k)), image, observed, model)
+            _draw(cameras[k], folder / picture_name(frames.name(k)), image, observed, model)
 
 
-def _draw(config: ObserveConfig, path: Path, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel) -> None:
+def _draw(
+    camera: np.ndarray | None, path: Path, image: np.ndarray, observations: ObjectPosteriors, model: ObservationModel
+) -> None:
     """The posterior over the image, as `OUT/NAME.png`."""
     from nolbo_ppl.viz.posterior_plots import draw_observations  # matplotlib is only needed for pictures
 
-    camera = guessed_intrinsics(image) if config.intrinsics is None else np.array(config.intrinsics)
+    camera = guessed_intrinsics(image) if camera is None else camera
     with atomic_path(path) as temporary:
         draw_observations(image, observations, camera, prior_mean=model.prior_mean(), path=temporary)
 

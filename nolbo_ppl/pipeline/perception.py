@@ -21,6 +21,8 @@ from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 STRUCTURED_LIGHT = 0.0015
 """Growth of the error of a structured light camera's depth with its square, 1/m (Khoshelham and Elberink 2012)."""
+PIXELS_AT_ONCE = 1 << 25
+"""Pixels of the images in memory at once (100 MB of colours), or one image: sixteen photographs of a phone are a gigabyte."""
 Picture = UInt8[np.ndarray, "h w 3"]
 Observe = Callable[[Sequence[Picture], Float[np.ndarray, " 4"]], Sequence[ObjectPosteriors]]
 """Images of one camera and its intrinsics to what is observed in each."""
@@ -196,11 +198,14 @@ def observe_images(
         observe: posteriors of each of some images.
         read: image of a number.
         count: how many there are.
-        batch: images in memory, and through the network, at once.
+        batch: images in memory, and through the network, at once; fewer where they are large.
     """
     with progress_bar(None, "observing", "image", total=count) as bar:
-        for first in range(0, count, batch):
-            part = range(first, min(first + batch, count))
-            images = [read(k) for k in part]
-            yield from zip(part, images, observe(images))
-            bar.update(len(part))
+        first, images, pixels = 0, [], 0
+        for k in range(count):
+            images.append(read(k))
+            pixels += images[-1].shape[0] * images[-1].shape[1]
+            if len(images) == batch or pixels >= PIXELS_AT_ONCE or k == count - 1:
+                yield from zip(range(first, k + 1), images, observe(images))
+                bar.update(len(images))
+                first, images, pixels = k + 1, [], 0

@@ -111,6 +111,28 @@ def test_without_pictures_and_intrinsics_by_the_command_line(
     assert [path.name for path in tmp_path.iterdir()] == ["observations.jsonl"]
 
 
+def test_each_photograph_has_the_focal_length_of_its_own_file(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a phone writes them: a wide lens, a long one, and a file whose camera nobody knows."""
+    (tmp_path / "images").mkdir()
+    picture = Image.fromarray(np.random.default_rng(3).integers(0, 256, (48, 96, 3), dtype=np.uint8))
+    for name, film in (("a.jpg", 18), ("b.jpg", 54), ("c.jpg", None)):
+        exif = Image.Exif()
+        if film is not None:
+            exif.get_ifd(0x8769)[0xA405] = film
+        picture.save(tmp_path / "images" / name, exif=exif)
+    main(["--images", str(tmp_path / "images"), "--out", str(tmp_path / "out"), "--model", str(model), "--no-pictures",
+          "--score-threshold", str(THRESHOLD)])  # fmt: skip
+    rows = [row for _, row in read_jsonl(tmp_path / "out" / "observations.jsonl")]
+    for name, camera in (("a.jpg", [48.0, 48, 48, 24]), ("b.jpg", [144.0, 144, 48, 24]), ("c.jpg", None)):
+        answer = load(model).observe(open_image(tmp_path / "images" / name), camera, threshold=THRESHOLD, decode=False)
+        own = [row["position"] for row in rows if row["image"] == name]
+        assert len(own) == len(answer) > 0
+        np.testing.assert_allclose(own, answer.position, rtol=1e-3, atol=1e-4)
+    assert "2 of 3 images tell their focal length" in capsys.readouterr().out
+
+
 def test_nothing_found_is_an_empty_file(model: Path, tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     Image.fromarray(np.full((64, 64, 3), 90, dtype=np.uint8)).save(tmp_path / "images" / "grey.png")

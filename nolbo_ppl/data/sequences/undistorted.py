@@ -13,7 +13,7 @@ from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder
 from nolbo_ppl.geometry.camera import guessed_pinhole
 from nolbo_ppl.geometry.distortion import undistort_depth, undistort_image
 from nolbo_ppl.io.camera_files import CameraIntrinsics, camera_of_images, read_camera
-from nolbo_ppl.io.images import exif_focal_length
+from nolbo_ppl.io.images import exif_focal_length, image_size
 
 
 class UndistortedFrames(FrameSequence):
@@ -95,6 +95,20 @@ def guessed_camera(size: tuple[int, int], focal: float | None = None) -> tuple[C
         "nothing of it: calibrate the camera"
     )
     return CameraIntrinsics(float(focal), float(focal), width / 2, height / 2, width, height), remark
+
+
+def photographed_cameras(frames: FrameSequence) -> list[Float[np.ndarray, " 4"] | None]:
+    """Intrinsics [fx, fy, cx, cy], px, of every image of a folder by the focal length in its EXIF data; None where it tells none.
+
+    Without distortion, the principal point in the middle: what a phone's or a camera's own file is good for.
+    """
+    cameras: list[Float[np.ndarray, " 4"] | None] = [None] * len(frames)
+    for k, file in enumerate(frames.files if isinstance(frames, ImageFolder) else ()):
+        focal = exif_focal_length(file)
+        if focal is not None:
+            width, height = image_size(file)
+            cameras[k] = np.array([focal, focal, width / 2, height / 2])
+    return cameras
 
 
 def recorded_camera(frames: FrameSequence) -> tuple[CameraIntrinsics, str] | None:

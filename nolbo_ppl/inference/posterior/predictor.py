@@ -110,8 +110,8 @@ class ObservationModel:
 
         Args:
             images: one image or a sequence of images, of any sizes; they are scaled to the network's own.
-            intrinsics: [fx, fy, cx, cy] in px of the given image, one for all or one an image. Without them the camera
-                is taken to see 60 degrees across, and positions are as good as that guess.
+            intrinsics: [fx, fy, cx, cy] in px of the given image, one for all or one an image (in a list None where they are
+                unknown). Without them the camera is taken to see 60 degrees across, and positions are as good as that guess.
             threshold: least objectness of a detection.
             iou_threshold: overlap above which the less certain of two regions is taken to describe the same object. Only
                 one region is responsible for an object, so that the probabilities of all that describe it add up.

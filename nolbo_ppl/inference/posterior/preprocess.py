@@ -118,16 +118,20 @@ def preprocess_all(
 
 
 def intrinsics_of(intrinsics: Any, index: int, count: int) -> Any:
-    """Intrinsics of one of `count` images, given for all at once or one an image; None where there are none.
+    """Intrinsics of one of `count` images, given for all at once or one an image (None in a list: unknown); None where there are
+    none.
 
     Raises:
         InputError: another number of rows than of images.
     """
     if intrinsics is None:
         return None
-    values = np.asarray(intrinsics, dtype=np.float64)
-    if values.ndim == 1:
-        return values
+    if isinstance(intrinsics, list | tuple) and any(one is None for one in intrinsics):
+        values: Any = intrinsics  # of some images alone
+    else:
+        values = np.asarray(intrinsics, dtype=np.float64)
+        if values.ndim == 1:
+            return values
     if len(values) != count:
         raise input_error("intrinsics", got=f"{len(values)} rows", expected=f"one for all or one for each of {count} images")
     return values[index]
