@@ -21,8 +21,8 @@ BOX_SIDE = 88.0
 """Longer side of the object's box in it, px."""
 MIN_SIDE = 8.0
 """Boxes smaller than this, px, are looked at as if they were of this size."""
-LEVELS = 4
-"""The image and its halves, quarters and eighths: a large object is cut from where it is nearest to the crop's size."""
+LEVELS = 5
+"""The image, its halves, quarters, eighths and sixteenths: a large object is cut from where it is nearest to the crop's size."""
 
 
 @dataclass
@@ -77,6 +77,31 @@ def cut_out(
     middle = torch.full_like(half, side / 2)
     crop = image.transpose(1, 2).unflatten(-1, (side, side)).contiguous(memory_format=torch.channels_last)
     return Crops(crop, torch.cat((middle - half, middle + half), -1), factor)
+
+
+def cut_out_detailed(
+    levels: tuple[Float[Tensor, "b 3 _ _"], ...],
+    detail: Float[Tensor, " b"] | None,
+    row: Int[Tensor, " n"],
+    box: Float[Tensor, "n 4"],
+    side: int = SIDE,
+    box_side: float = BOX_SIDE,
+) -> Crops:
+    """`cut_out` of images that are larger than those whose pixels the boxes are in.
+
+    Args:
+        levels: the larger images at falling sizes.
+        detail: their pixels over those of the boxes; None where they are the same.
+        row: the image of each object.
+        box: where it is, px.
+        side: height and width of a crop, px.
+        box_side: longer side of the object's box in it, px.
+    """
+    if detail is None:
+        return cut_out(levels, row, box, side, box_side)
+    larger = detail[row].to(box.dtype)
+    crops = cut_out(levels, row, box * larger[:, None], side, box_side)
+    return Crops(crops.image, crops.box, crops.factor * larger)
 
 
 def range_shift(factor: Float[Tensor, " n"], spread: float) -> Float[Tensor, " n"]:

@@ -26,7 +26,7 @@ from nolbo_ppl.models.distributions import (
 from nolbo_ppl.models.distributions.bernoulli import Objectness
 from nolbo_ppl.models.head import RegionHead
 from nolbo_ppl.models.model_config import ModelConfig
-from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
+from nolbo_ppl.models.observed_scene import Detail, Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.pyro_parameters import declare_parameters
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_centre, cell_of, decode_box, encode_box, encode_range
@@ -80,8 +80,12 @@ class Guide(nn.Module):
     def _prior(self) -> LabelPrior:
         return self._shared[0]
 
-    def encode(self, image: Tensor) -> Encoding:
+    def encode(self, image: Tensor, detail: Detail | None = None) -> Encoding:
         """Run the encoder on whole images, uint8 or float in 0..255, sides multiples of 32.
+
+        Args:
+            image: the images.
+            detail: the same larger, for looks at objects cut out of them; not needed by guides that take none.
 
         Raises:
             InputError: the image batch has the wrong shape or sides.
@@ -95,8 +99,10 @@ class Guide(nn.Module):
             maps, fine = self.encoder(x)
             features = maps.flatten(2).transpose(1, 2)
             logit = self.head.objectness(features).flatten(1)
-        levels = () if self.shape_look is None else image_levels(x)
-        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine, levels=levels)
+        levels, factor = () if self.shape_look is None else image_levels(x), None
+        if self.shape_look is not None and detail is not None:
+            levels, factor = image_levels(normalise_image(detail.image, dtype)), detail.factor
+        return Encoding(features, logit.to(dtype), maps.shape[2], maps.shape[3], fine, levels=levels, detail=factor)
 
     def parameters_at(
         self,
@@ -140,7 +146,7 @@ class Guide(nn.Module):
         if self.shape_look is None or len(row) == 0:
             return raw
         with self._autocast():
-            change = self.shape_look(encoding.levels, row, box, raw).to(raw.dtype)
+            change = self.shape_look(encoding.levels, row, box, raw, encoding.detail).to(raw.dtype)
         before = self.head.sizes[0]
         return raw + nn.functional.pad(change, (before, raw.shape[-1] - before - change.shape[-1]))
 

@@ -17,13 +17,13 @@ from torch import Tensor
 from nolbo_ppl.geometry.boxes import box_area, box_iou
 from nolbo_ppl.models.backbones import check_image, normalise_image
 from nolbo_ppl.models.category_sizes import CategorySizes
-from nolbo_ppl.models.crops import SIDE, cut_out, image_levels, range_shift
+from nolbo_ppl.models.crops import SIDE, cut_out_detailed, image_levels, range_shift
 from nolbo_ppl.models.evidence import ROLE_SIDE, Evidence, Fused, Fusion, detector_evidence, gather_evidence
 from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.image_shift import ImageShift
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
-from nolbo_ppl.models.observed_scene import Encoding, ObservedScene, RegionParameters
+from nolbo_ppl.models.observed_scene import Detail, Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
 from nolbo_ppl.models.yolox import WIDTH, YoloxNano
@@ -114,8 +114,8 @@ class HybridGuide(Guide):
             levels,
         )
 
-    def encode(self, image: Tensor) -> HybridEncoding:
-        """Gather the evidence of whole images and weigh it; see `gather`."""
+    def encode(self, image: Tensor, detail: Detail | None = None) -> HybridEncoding:
+        """Gather the evidence of whole images and weigh it; see `gather` and `Guide.encode`."""
         one = self.gather(image)
         cell = torch.arange(one.rows * one.columns, device=image.device).repeat_interleave(self.config.predictors)
         cell = cell.expand(len(image), -1)
@@ -124,7 +124,11 @@ class HybridGuide(Guide):
         with torch.no_grad():
             shift, generated = self.shift(one.context), self.fusion.generated(one.context)
         logit = fused.objectness_logit
-        return HybridEncoding(one.features, logit, one.rows, one.columns, (), shift, generated, one.levels, fused=fused, box=box)
+        levels, factor = one.levels, None
+        if detail is not None:
+            levels, factor = image_levels(normalise_image(detail.image, logit.dtype)), detail.factor
+        whole = (one.features, logit, one.rows, one.columns, (), shift, generated)
+        return HybridEncoding(*whole, levels, factor, fused=fused, box=box)
 
     def parameters_at(
         self,
@@ -158,7 +162,7 @@ class HybridGuide(Guide):
             start = self.head.get_buffer("start")[-1].to(dtype).expand(len(row), -1)
             return torch.cat((labels, start[:, label_size:first], located, start[:, first + box_size :]), -1)
         place = encoding.box[row, region] if box is None else box
-        raw, factor = self.look_at(encoding.levels, row, place)
+        raw, factor = self.look_at(encoding.levels, row, place, encoding.detail)
         shift = range_shift(factor, self.config.range_spread[0])
         ranges = torch.cat((raw[:, first + box_size :][:, :1] + shift[:, None], raw[:, first + box_size + 1 :]), -1)
         seen = fused.look_weight[row, region][:, None] * torch.log_softmax(raw[:, :label_size], -1)
@@ -166,12 +170,17 @@ class HybridGuide(Guide):
         return self.look_at_shapes(answer, encoding, row, place)
 
     def look_at(
-        self, levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]
+        self,
+        levels: tuple[Tensor, ...],
+        row: Int[Tensor, " n"],
+        box: Float[Tensor, "n 4"],
+        detail: Float[Tensor, " b"] | None = None,
     ) -> tuple[Float[Tensor, "n outputs"], Float[Tensor, " n"]]:
-        """Raw outputs of the second look at boxes, px, cut out of images, and pixels of each crop over those of its image."""
+        """Raw outputs of the second look at boxes, px, cut out of images (`crops.cut_out_detailed`), and pixels of each crop
+        over those of its image."""
         dtype = self.head.objectness.weight.dtype
         with torch.no_grad():
-            crops = cut_out(levels, row, box.detach())
+            crops = cut_out_detailed(levels, detail, row, box.detach())
         number, cells = torch.arange(len(row), device=row.device), SIDE // self.config.stride
         cell = torch.full_like(number, (cells * cells) // 2)
         with self._autocast():

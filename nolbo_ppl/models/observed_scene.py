@@ -10,10 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch
+
+
+@dataclass(frozen=True)
+class Detail:
+    """The images of a batch once more, larger than the network sees them whole: objects are cut out of these."""
+
+    image: UInt8[Tensor, "b 3 h w"]
+    factor: Float[Tensor, " b"]
+    """Its pixels over those of the image that the network sees."""
 
 
 @dataclass
@@ -34,6 +43,8 @@ class Encoding:
     """Probability that each is a generated scene; None where the guide cannot tell."""
     levels: tuple[Float[Tensor, "b 3 _ _"], ...] = ()
     """The normalised images at falling sizes, for looks at objects cut out of them; empty where the guide takes none."""
+    detail: Float[Tensor, " b"] | None = None
+    """Pixels of the largest of `levels` over those of each image; None: they are the same."""
 
 
 @dataclass

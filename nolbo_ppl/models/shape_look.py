@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nolbo_ppl.models.backbones import TinyEncoder
-from nolbo_ppl.models.crops import BOX_SIDE, SIDE, cut_out
+from nolbo_ppl.models.crops import BOX_SIDE, SIDE, cut_out_detailed
 from nolbo_ppl.models.layers import OutputLinear
 from nolbo_ppl.models.model_config import ModelConfig
 
@@ -71,6 +71,7 @@ class ShapeLook(nn.Module):
         row: Int[Tensor, " n"],
         box: Float[Tensor, "n 4"],
         raw: Float[Tensor, "n outputs"],
+        detail: Float[Tensor, " b"] | None = None,
     ) -> Float[Tensor, "n 2*d"]:
         """What the look adds to the raw mean and log scale of each object's shape latent.
 
@@ -79,9 +80,10 @@ class ShapeLook(nn.Module):
             row: the image of each object.
             box: where it is, [x0, y0, x1, y1], px of the image.
             raw: the guide's outputs so far; no gradient goes into them.
+            detail: pixels of the largest images over those of the boxes; None where they are the same.
         """
         with torch.no_grad():
-            crops = cut_out(levels, row, box.detach(), self.side, BOX_SHARE * self.side)
+            crops = cut_out_detailed(levels, detail, row, box.detach(), self.side, BOX_SHARE * self.side)
         maps, _ = self.encoder(crops.image)
         seen = self.narrow(maps).flatten(1)
         context = torch.tanh(raw.detach() / CONTEXT_SCALE).to(seen.dtype)

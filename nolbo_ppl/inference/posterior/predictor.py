@@ -27,7 +27,7 @@ from nolbo_ppl.inference.posterior.preprocess import guessed_intrinsics as guess
 from nolbo_ppl.models.hybrid_guide import HybridGuide
 from nolbo_ppl.models.image_shift import ODDS_PER_SHIFT, SCALE_PER_SHIFT, excess
 from nolbo_ppl.models.observation_model import Nolbo
-from nolbo_ppl.models.observed_scene import Encoding, RegionParameters
+from nolbo_ppl.models.observed_scene import Detail, Encoding, RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import decode_box
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
@@ -179,9 +179,11 @@ class ObservationModel:
         return self._observe(prepared, responsible, decode, samples, seed, batch)
 
     @torch.inference_mode()
-    def encode(self, image: UInt8[Tensor, "b 3 h w"]) -> Encoding:
-        """The network's forward pass over a batch of prepared images."""
-        return self._networks.guide.encode(image.to(self.device))
+    def encode(self, image: UInt8[Tensor, "b 3 h w"], detail: Detail | None = None) -> Encoding:
+        """The network's forward pass over a batch of prepared images, and the same larger where there are any."""
+        at = self.device
+        larger = None if detail is None else Detail(detail.image.to(at), detail.factor.to(at))
+        return self._networks.guide.encode(image.to(at), larger)
 
     def _decoded(self, latent: Float[Tensor, "n d"]) -> Float[Tensor, "n v v v"]:
         """Log odds of the voxels of latents."""
@@ -205,7 +207,7 @@ class ObservationModel:
         shapes = self._shapes(decode, samples, seed)
         results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
-            encoding = self.encode(torch.stack([prepared[i].image for i in group]))
+            encoding = self.encode(torch.stack([prepared[i].image for i in group]), detail_of([prepared[i] for i in group]))
             shift = None if encoding.shift is None else encoding.shift.cpu()
             logit = self.calibration.objectness(encoding.objectness_logit.cpu())
             if shift is not None:
@@ -255,7 +257,9 @@ class ObservationModel:
         )
 
     def _preprocess_all(self, images: Sequence[Any], intrinsics: Any, size: int | None) -> list[PreprocessedImage]:
-        return preprocess_all(images, intrinsics, self.config.image_size if size is None else size, self._prior_mean.dtype)
+        cuts_out = bool(self.config.detector or self.config.shape_look)
+        size = self.config.image_size if size is None else size
+        return preprocess_all(images, intrinsics, size, self._prior_mean.dtype, cuts_out)
 
     def _parameters(
         self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
@@ -304,3 +308,12 @@ class ObservationModel:
     def _category_extents(self) -> Float[np.ndarray, "labels 3"]:
         """Extents, in diagonals, of each category's mean shape."""
         return extents(self.decode(self.prior_mean()))
+
+
+def detail_of(images: Sequence[PreprocessedImage]) -> Detail | None:
+    """The larger images of a batch of one shape; None where there are none."""
+    details = [image.detail for image in images if image.detail is not None]
+    if not details:
+        return None
+    factor = torch.tensor([image.detail_factor for image in images], dtype=images[0].camera.dtype, device="cpu")
+    return Detail(torch.stack(details), factor)

@@ -19,6 +19,11 @@ Image = UInt8[np.ndarray, "h w 3"] | UInt8[Tensor, "3 h w"]
 """An image: a uint8 array of height x width x 3 colours, or a torch tensor with the colours first."""
 PADDING = 114
 """Grey value of the bars beside an image."""
+DETAIL = (1.15, 2.0)
+"""Objects are cut out of an image this many times larger than the network sees it whole: where there is less to be gained it is
+not kept, and no more for the sake of memory. (On cars of photographs seen at 208 px: docs/results.md.)"""
+DETAIL_PIXELS = 1 << 23
+"""Pixels of the larger images of a batch (130 MB of normalised colours at all sizes), or one image."""
 MIN_SIDE = 8
 """Least height and width of an image, px."""
 
@@ -37,6 +42,10 @@ class PreprocessedImage:
     """Width and height of the scaled image without its bars, px."""
     guessed: bool = False
     """The camera is a guess."""
+    detail: UInt8[Tensor, "3 h2 w2"] | None = None
+    """The image larger than `image`, for looks at objects cut out of it; None where the given one is hardly larger."""
+    detail_factor: float = 1.0
+    """Pixels of `detail` over those of `image`."""
 
 
 def guessed_intrinsics(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 4"]:
@@ -72,7 +81,9 @@ def checked(image: Any, intrinsics: Any) -> tuple[UInt8[np.ndarray, "h w 3"], Fl
     return image, camera
 
 
-def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32) -> PreprocessedImage:
+def preprocess(
+    image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torch.float32, detailed: bool = False
+) -> PreprocessedImage:
     """Scale an image uniformly so that its longer side has the wanted size; grey bars make both multiples of 32.
 
     The rule of training (`nolbo_ppl.data.dataset_folder.letterbox`), with bars on the right and below: pixels keep their place.
@@ -82,6 +93,7 @@ def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torc
         intrinsics: [fx, fy, cx, cy] in px of the given image; guessed when None.
         size: longer side of the scaled image, px.
         dtype: of the scaled intrinsics.
+        detailed: keep the image larger too, where it is (`DETAIL`).
 
     Raises:
         InputError: see `checked`.
@@ -90,21 +102,39 @@ def preprocess(image: Any, intrinsics: Any, size: int, dtype: torch.dtype = torc
     height, width = image.shape[:2]
     factor = size / max(height, width)
     new = [max(1, round(side * factor)) for side in (width, height)]
-    if [width, height] != new:
-        from PIL import Image as PillowImage
-
-        image = np.asarray(PillowImage.fromarray(image).resize((new[0], new[1]), PillowImage.Resampling.BILINEAR))
+    given, image = image, _resized(image, new)
     scale = np.array([new[0] / width, new[1] / height])
-    bars = [-side % 32 for side in new]
+    tensor = _padded(image, [side + -side % 32 for side in new])
+    scaled = torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype)
+    larger = min(1 / factor, DETAIL[1]) if detailed else 1.0
+    detail = None
+    if larger >= DETAIL[0]:
+        sides = [max(1, round(side * factor * larger)) for side in (width, height)]
+        detail = _padded(_resized(given, sides), [round(side * larger) for side in (tensor.shape[2], tensor.shape[1])])
+    return PreprocessedImage(
+        tensor, scaled, scale, (new[0], new[1]), intrinsics is None, detail, larger if detail is not None else 1.0
+    )
+
+
+def _resized(image: UInt8[np.ndarray, "h w 3"], sides: Sequence[int]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """An image of this width and height."""
+    if [image.shape[1], image.shape[0]] == [*sides]:
+        return image
+    from PIL import Image as PillowImage
+
+    return np.asarray(PillowImage.fromarray(image).resize((sides[0], sides[1]), PillowImage.Resampling.BILINEAR))
+
+
+def _padded(image: UInt8[np.ndarray, "h w 3"], sides: Sequence[int]) -> UInt8[Tensor, "3 h2 w2"]:
+    """The image with grey bars on the right and below, up to a width and height."""
+    bars = [max(0, side - own) for side, own in zip(sides, (image.shape[1], image.shape[0]))]
     if any(bars):
         image = np.pad(image, ((0, bars[1]), (0, bars[0]), (0, 0)), constant_values=PADDING)
-    tensor = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
-    scaled = torch.as_tensor(camera * np.tile(scale, 2), dtype=dtype)
-    return PreprocessedImage(tensor, scaled, scale, (new[0], new[1]), guessed=intrinsics is None)
+    return torch.from_numpy(np.ascontiguousarray(image[: sides[1], : sides[0]].transpose(2, 0, 1)))
 
 
 def preprocess_all(
-    images: Sequence[Any], intrinsics: Any, size: int, dtype: torch.dtype = torch.float32
+    images: Sequence[Any], intrinsics: Any, size: int, dtype: torch.dtype = torch.float32, detailed: bool = False
 ) -> list[PreprocessedImage]:
     """Images of any shapes, with intrinsics [4] for all or [n, 4], a row an image; see `preprocess`.
 
@@ -114,7 +144,8 @@ def preprocess_all(
     """
     if size <= 0 or size % 32:
         raise input_error("size of the scaled images", got=size, expected="a positive multiple of 32")
-    return [preprocess(image, intrinsics_of(intrinsics, i, len(images)), size, dtype) for i, image in enumerate(images)]
+    count = len(images)
+    return [preprocess(image, intrinsics_of(intrinsics, i, count), size, dtype, detailed) for i, image in enumerate(images)]
 
 
 def intrinsics_of(intrinsics: Any, index: int, count: int) -> Any:
@@ -138,11 +169,13 @@ def intrinsics_of(intrinsics: Any, index: int, count: int) -> Any:
 
 
 def same_shape(prepared: Sequence[PreprocessedImage], batch: int) -> list[list[int]]:
-    """Groups of at most `batch` images of one shape, in order, as numbers of the images."""
+    """Groups of at most `batch` images of one shape, in order, as numbers of the images; fewer where their details are large."""
     groups: dict[tuple[int, ...], list[list[int]]] = {}
     for i, one in enumerate(prepared):
-        of_shape = groups.setdefault(tuple(one.image.shape), [[]])
-        if len(of_shape[-1]) == batch:
+        shape = (*one.image.shape, *(() if one.detail is None else one.detail.shape))
+        of_shape = groups.setdefault(shape, [[]])
+        pixels = 0 if one.detail is None else one.detail.shape[1] * one.detail.shape[2]
+        if len(of_shape[-1]) == min(batch, max(1, DETAIL_PIXELS // max(pixels, 1))):
             of_shape.append([])
         of_shape[-1].append(i)
     return [group for of_shape in groups.values() for group in of_shape]
