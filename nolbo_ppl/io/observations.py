@@ -1,7 +1,8 @@
 """Files of observations: `Detections` read from and written to JSON Lines, checked field by field.
 
 One detection a line: `frame` (row of the odometry, from 0) and `position` [x, y, z] m in the camera frame; optional
-`position_std` (a number or 3) or `position_cov` (3x3), `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
+`position_std` (a number or 3) or `position_cov` (3x3), `position_tails` [degrees of freedom, factor on the covariance] of
+Student's t about the position, `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
 `rotation_modes` (a list of `weight`, `rotation`, `std`: all modes of the orientation), `latent` [d], `latent_std` (a number
 or d), `objectness` (default 1), `category`, `size` [3] m, `symmetry` (1 none, n n-fold, 0 free about the object's vertical
 axis), `id`. A model's own lines say more, which SLAM does not use and every reader keeps: `image`, `time` s, `box`
@@ -38,6 +39,7 @@ FIELDS = (
     "position",
     "position_std",
     "position_cov",
+    "position_tails",
     "rotation",
     "rotation_std",
     "rotation_modes",
@@ -197,6 +199,11 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
         out["position_covariance"] = covariance
     elif row.get("position_std") is not None:
         out["position_covariance"] = np.diag(_scale(row, "position_std", 3, where) ** 2)
+    if row.get("position_tails") is not None:
+        out["position_tails"] = tails = _vector(row, "position_tails", 2, where)
+        if not (tails > 0).all():
+            expected = "degrees of freedom and a factor, above 0"
+            raise input_error("`position_tails` are no law", got=row["position_tails"], expected=expected, **where)
     if row.get("rotation") is not None:
         out["rotation"] = _rotation(row, where)
     if row.get("rotation_std") is not None:
@@ -301,6 +308,7 @@ def _table(rows: list[dict[str, Any]]) -> Detections:
         "azimuth_weight": (azimuths,),
         "azimuth": (azimuths,),
         "azimuth_concentration": (azimuths,),
+        "position_tails": (2,),
     }
 
     def column(name: str) -> np.ndarray:

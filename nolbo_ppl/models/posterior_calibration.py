@@ -77,6 +77,11 @@ class Calibration:
             return None
         return StudentT(self.position_dof, self.position_spread)
 
+    @property
+    def stated_tails(self) -> tuple[float, float] | None:
+        """The same as two numbers, as answers state it: degrees of freedom and factor on the covariance."""
+        return None if self.position_tails is None else (self.position_dof, self.position_spread)
+
     def apply(self, q: RegionParameters) -> RegionParameters:
         """Calibrated posterior parameters."""
         return dataclasses.replace(

@@ -47,6 +47,10 @@ def check_table(table: Detections, frames: int) -> None:
         covariance,
         "positive eigenvalues",
     )
+    tails = np.where(np.isnan(table.position_tails), 2.0, table.position_tails)
+    bad = np.isnan(table.position_tails).any(axis=1) != np.isnan(table.position_tails).all(axis=1)
+    bad |= ~np.isfinite(tails).all(axis=1) | (tails <= 0).any(axis=1)
+    refuse(bad, "position_tails are no law", table.position_tails, "degrees of freedom and a factor, above 0")
     rotation = np.where(table.has_rotation[:, None, None], table.rotation, np.eye(3))
     residual = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2), initial=0)
     refuse(~(residual < 1e-3) | (np.linalg.det(rotation) < 0), "rotation is no rotation", rotation, "orthonormal")

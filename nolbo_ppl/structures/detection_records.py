@@ -62,6 +62,8 @@ def _record(d: Detections, i: int, quaternion: np.ndarray, mode_quaternion: np.n
             row["position_std"] = np.sqrt(np.diag(covariance)).tolist()
         else:
             row["position_cov"] = covariance.tolist()
+    if np.isfinite(d.position_tails[i]).all():
+        row["position_tails"] = d.position_tails[i].tolist()
     if np.isfinite(d.rotation[i]).all():
         row["rotation"] = quaternion.tolist()
     if np.isfinite(d.rotation_scale[i]):

@@ -80,6 +80,9 @@ class Detections:
     """Their mean directions, allocentric, rad."""
     azimuth_concentration: Float[np.ndarray, "n M"] = NOT_STATED
     """Their concentrations."""
+    position_tails: Float[np.ndarray, "n 2"] = NOT_STATED
+    """Law of the true position about the stated one: degrees of freedom of Student's t, and the factor on the covariance that
+    makes it the scale matrix; NaN: nobody states one."""
 
     def __post_init__(self) -> None:
         n = len(self.frame)
@@ -274,6 +277,7 @@ OPTIONAL: dict[str, tuple[int, ...]] = {
     "azimuth_weight": (0,),
     "azimuth": (0,),
     "azimuth_concentration": (0,),
+    "position_tails": (2,),
 }
 """Numbers that a table may be made without, and the shape of a row that nobody stated."""
 

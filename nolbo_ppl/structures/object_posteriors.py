@@ -112,6 +112,9 @@ class ObjectPosteriors:
     sized: bool = False
     """Distances and sizes already hold what a box's height and a category's size tell; who knows better sizes replaces them,
     for the same height counted twice would be too sure."""
+    position_tails: tuple[float, float] | None = None
+    """Law of the true positions about these: degrees of freedom of Student's t, and the factor on the covariance that makes it
+    the scale matrix (the model's calibration). None: Gaussian."""
     shift: float | None = None
     """How unlike the images that were learnt from this image is: 0 like the middle one, 1 as 3 in 100; beyond, objects are less
     probable and every scale is wider. None for models that cannot tell."""
@@ -223,12 +226,13 @@ class ObjectPosteriors:
             azimuth_weight=significant(self.viewpoint_modes.weights),
             azimuth=significant(self.viewpoint_modes.azimuth),
             azimuth_concentration=significant(self.viewpoint_modes.concentration),
+            position_tails=self._tails,
         )
 
     def _undescribed(self, frame: int, image: str | None, time: float | None) -> Detections:
         """Detections without category and orientation: box, position, size and latent."""
         n = len(self)
-        return Detections.from_arrays(
+        table = Detections.from_arrays(
             np.full(n, frame),
             significant(self.position),
             position_covariance=significant(self.position_covariance, 10),
@@ -241,6 +245,12 @@ class ObjectPosteriors:
             time=np.full(n, np.nan if time is None else time),
             box=significant(self.box),
         )
+        return dataclasses.replace(table, position_tails=self._tails)
+
+    @property
+    def _tails(self) -> Float[np.ndarray, "n 2"]:
+        """A row of `Detections.position_tails` for each object."""
+        return np.tile(significant(np.array(self.position_tails or (np.nan, np.nan))), (len(self), 1))
 
     def to_records(self, frame: int, image: str) -> Iterator[dict[str, Any]]:
         """One JSON-able dictionary an object, the lines of `observations.jsonl`."""

@@ -226,6 +226,7 @@ class ObservationModel:
                 one = answer[slice(ends[k], ends[k + 1])]
                 if encoding.generated is not None:  # of generated scenes the guide's own range is left alone
                     one = replace(one, sized=bool(encoding.generated[k] < 0.5))
+                one = replace(one, position_tails=self.calibration.stated_tails)
                 results[i] = one if shift is None else replace(one, shift=float(shift[k]))
         return [results[i] for i in range(len(prepared))]
 

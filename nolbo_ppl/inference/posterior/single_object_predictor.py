@@ -121,7 +121,8 @@ class SingleObjectModel(ObservationModel):
             answer = assemble(regions, self.config, self._prior, self._prior_mean, shapes)
             back = crops.back(torch.as_tensor(answer.box, dtype=dtype)).numpy()
             scale = answer.box_scale / np.concatenate([crops.factor.numpy()[:, None].repeat(2, 1), np.ones((len(back), 2))], 1)
-            results.append(dataclasses.replace(answer, box=back, box_scale=scale))
+            tails = self.calibration.stated_tails
+            results.append(dataclasses.replace(answer, box=back, box_scale=scale, position_tails=tails))
         return results
 
 

@@ -97,7 +97,8 @@ class SlamConfig:
     """Its growth with range, m per m."""
     position_tails: tuple[float, float] | None = None
     """Student's t in place of Gaussians for observed positions: degrees of freedom, and the factor on their stated covariances
-    that makes them its scale matrices. What a model's calibration found, in a run from images. None: Gaussian."""
+    that makes them its scale matrices. None: what the detections state, in a run from images what the model's calibration found;
+    Gaussian where nobody states it."""
     rotation_scale: float | None = None
     """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
     latent_scale: float | None = None

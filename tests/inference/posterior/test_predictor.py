@@ -482,3 +482,16 @@ def test_answers_say_whether_a_height_is_in_their_ranges(generated: bool) -> Non
     assert seen.sized is not generated and seen[:1].sized is seen.sized
     (plain,) = observer().observe_boxes([picture()], CAMERA, [box], decode=False)
     assert plain.sized is False
+
+
+def test_answers_state_the_law_of_their_positions_and_no_more_certainty_than_is_supported() -> None:
+    networks = tiny_model(scatter=0.3)
+    plain = ObservationModel(networks, Calibration(objectness_shift=30.0))
+    careful = ObservationModel(
+        networks, Calibration(objectness_shift=30.0, objectness_limit=0.9, position_dof=3.0, position_spread=0.4)
+    )
+    without, found = plain.observe(picture(), decode=False), careful.observe(picture(), decode=False)
+    assert without.position_tails is None and np.isnan(without.detections(0).position_tails).all()
+    assert found.position_tails == (3.0, 0.4)
+    assert found[:1].detections(0).position_tails.tolist() == [[3.0, 0.4]]
+    assert len(found) and float(without.objectness.max()) > 0.99 and float(found.objectness.max()) <= 0.9

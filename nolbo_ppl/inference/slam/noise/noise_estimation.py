@@ -79,9 +79,8 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
     report: dict[str, float] = {"pairs": float(len(pairs.first))}
     warnings: list[str] = []
     covariance = _position_covariance(table, pairs, config, report, warnings)
-    if config.position_tails is not None:  # what was stated is a covariance; the law with tails has a scale matrix
-        stated = np.isfinite(table.position_covariance).all(axis=(1, 2))
-        covariance = np.where(stated[:, None, None], covariance * config.position_tails[1], covariance)
+    dof, spread = position_law(table, config)
+    covariance = covariance * spread[:, None, None]
     rotation_scale = _rotation_scale(problem, pairs, config, report, warnings)
     latent_scale = _latent_scale(table, pairs, config, report, warnings)
     volume = view_volume(table)
@@ -100,8 +99,22 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
         report=report,
         warnings=tuple(warnings),
         step_correlation=correlation,
-        position_dof=None if config.position_tails is None else config.position_tails[0],
+        position_dof=dof,
     )
+
+
+def position_law(table: Detections, config: SlamConfig) -> tuple[float | None, Float[np.ndarray, " n"]]:
+    """Degrees of freedom of all positions (None: Gaussian), and the factor that makes each stated covariance a scale matrix.
+
+    The configuration's, else what the detections state: the median of their degrees of freedom, each its own factor.
+    """
+    stated = np.isfinite(table.position_covariance).all(axis=(1, 2))
+    if config.position_tails is not None:
+        return config.position_tails[0], np.where(stated, config.position_tails[1], 1.0)
+    told = np.isfinite(table.position_tails).all(axis=1)
+    if not told.any():
+        return None, np.ones(len(table))
+    return float(np.median(table.position_tails[told, 0])), np.where(stated & told, table.position_tails[:, 1], 1.0)
 
 
 def step_sigmas(
