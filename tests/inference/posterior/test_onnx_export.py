@@ -68,9 +68,19 @@ def compared(found: dict[str, np.ndarray], expected: ObjectPosteriors) -> int:
     return matched
 
 
-@pytest.mark.parametrize("changes", [{}, {"detector": "yolox_nano"}, {"orientation": "angle", "voxel_patches": False}], ids=str)
+CHANGES: list[dict[str, Any]] = [
+    {"shape_look": 32},
+    {"detector": "yolox_nano"},
+    {"orientation": "angle", "voxel_patches": False},
+]
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=str)
 def test_onnxruntime_gives_the_same_posterior(tmp_path: Path, changes: dict[str, Any]) -> None:
-    model = ObservationModel(tiny_model(tiny_config(**changes), scatter=0.3), CALIBRATION)
+    networks = tiny_model(tiny_config(**changes), scatter=0.3)
+    if networks.guide.shape_look is not None:
+        torch.nn.init.normal_(networks.guide.shape_look.judge[-1].weight, std=0.3, generator=torch.Generator().manual_seed(2))
+    model = ObservationModel(networks, CALIBRATION)
     candidates = 2 * 4 * 4 if not changes.get("detector") else 20
     files = export_onnx(model, tmp_path, (64, 64), candidates)
     image = np.random.default_rng(3).integers(0, 256, (64, 64, 3), dtype=np.uint8)
