@@ -4,8 +4,9 @@
     OMP_NUM_THREADS=1 python benchmarks/observation_tails.py --model photo --photographs val.json --write
 
 Half of the scenes are standard, half full. Positions are known in scenes alone; with `--photographs` the largest certainty is
-that of labelled photographs, every third from the first (`nolbo evaluate --part 1 3` measures every third from the second). With
-`--write` both numbers go into the model's config.json.
+that of labelled photographs, every third from the first (`nolbo evaluate --part 1 3` measures every third from the second), and
+`--evidence` first fits on these how a detector's evidence is read, as the last stage of training does. With `--write` it all goes
+into the model's folder.
 """
 
 from __future__ import annotations
@@ -20,14 +21,15 @@ import tyro
 
 import nolbo_ppl
 from nolbo_ppl.cli.evaluate import EvaluateConfig, Evaluation, measure, open_scenes
+from nolbo_ppl.data.converters.photographs import read_photographs
 from nolbo_ppl.evaluation.photograph_run import evaluate_photographs
 from nolbo_ppl.evaluation.scores import MIN_OBJECTNESS, judged
-from nolbo_ppl.inference.posterior.model_folder import load
+from nolbo_ppl.inference.posterior.model_folder import load, save
 from nolbo_ppl.inference.posterior.predictor import ObservationModel
 from nolbo_ppl.io.files import read_json, write_json
 from nolbo_ppl.models.posterior_calibration import CERTAIN
 from nolbo_ppl.training.calibrate_answers import calibrate_answers
-from nolbo_ppl.training.photograph_fit import PARTS
+from nolbo_ppl.training.photograph_fit import PARTS, adopt_fit, find_objects, fit_found
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,10 @@ class Arguments:
     """Their seeds; so many scenes of each."""
     photographs: Path | None = None
     """Labelled photographs (COCO-style JSON), for the largest certainty."""
+    evidence: bool = False
+    """Fit factor and shift of a detector's evidence on the photographs first (`nolbo_ppl.training.photograph_fit`)."""
     write: bool = False
-    """Write the two numbers into the model's folder."""
+    """Write what was fitted into the model's folder."""
 
 
 def answers(model: ObservationModel, arguments: Arguments) -> list[Evaluation]:
@@ -66,6 +70,12 @@ def main(arguments: Arguments) -> None:
     """Fit, and write where asked."""
     model = load(arguments.model)
     plain = dataclasses.replace(model.calibration, objectness_limit=CERTAIN)
+    if arguments.evidence and arguments.photographs is not None:
+        photos = read_photographs(arguments.photographs, categories=model.config.categories)[::PARTS]
+        fit = fit_found(find_objects(model.model, photos), photos)
+        assert fit is not None, "too few objects in these photographs"
+        adopt_fit(model.model, fit)
+        print(fit)
     found = answers(ObservationModel(model.model, plain), arguments)
     squared = np.concatenate([one.objects.position_squared for one in found])
     squared = squared[np.isfinite(squared)]
@@ -88,8 +98,11 @@ def main(arguments: Arguments) -> None:
         given = Path(arguments.model)
         file = (given if given.is_dir() else Path(nolbo_ppl.__file__).parent / "weights" / given) / "config.json"
         values = read_json(file)
-        values["calibration"] = fitted.to_json()
-        write_json(file, values)
+        if arguments.evidence:
+            meta = {name: value for name, value in values.items() if name not in ("model", "calibration", "sha256")}
+            save(file.parent, model.model, fitted, meta, half=not given.is_dir())  # as shipped weights are
+        else:
+            write_json(file, {**values, "calibration": fitted.to_json()})
 
 
 if __name__ == "__main__":
