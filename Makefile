@@ -65,10 +65,11 @@ test-newest:
 	build/newest/bin/python -m pip install --quiet --upgrade -e . pytest hypothesis mpmath beartype
 	OMP_NUM_THREADS=1 build/newest/bin/python -m pytest -q $(DEPENDENCY_TESTS)
 
-# Known vulnerabilities of what a user gets (asks the advisory database of the package index).
+# Known vulnerabilities of what a user gets; status 3 where no advisory service answers.
 audit: wheel
-	$(BIN)/python -m pip install --quiet pip-audit
-	$(BIN)/python -m pip_audit --path build/bare/lib/python3.*/site-packages --skip-editable
+	$(PYTHON) -m venv build/audit
+	build/audit/bin/python -m pip install --quiet pip-audit
+	build/audit/bin/python tools/audit.py --path build/bare/lib/python3.*/site-packages
 
 bench: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/observation.py --out build/observation.json

@@ -15,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+import audit
 import bill_of_materials as bom
 from lower_bounds import lower_bounds
 
@@ -69,3 +70,56 @@ def test_shapes_are_text() -> None:
     files = sorted((ROOT / "nolbo_ppl").rglob("*.py"))
     assert len(files) > 100
     assert [str(file) for file in files if bare.search(file.read_text(encoding="utf-8"))] == []
+
+
+def test_what_an_advisory_service_knows_is_told_by_name() -> None:
+    advisory = {"id": "PYSEC-1", "aliases": ["CVE-2"], "fix_versions": ["1.1", "2.0"]}
+    report = {
+        "dependencies": [
+            {"name": "a", "version": "1.0", "vulns": [advisory, {"id": "PYSEC-3", "fix_versions": []}]},
+            {"name": "b", "version": "2.0", "vulns": []},
+            {"name": "c", "skip_reason": "not on the index"},
+        ]
+    }
+    known, told = audit.judge(report)
+    assert known == ["a 1.0: PYSEC-1, mended in 1.1, 2.0", "a 1.0: PYSEC-3, mended in no version"]
+    assert told == ["not audited: c: not on the index"]
+    known, told = audit.judge(report, {"CVE-2": "the function is not called"})
+    assert len(known) == 1 and "excepted: a 1.0: CVE-2: the function is not called" in told
+
+
+def test_packages_of_an_environment_are_asked_for_without_local_versions(tmp_path: Path) -> None:
+    for name, version in (("torch", "2.9.0+cpu"), ("A_b", "1.0"), ("nolbo-ppl", "0.2.0")):
+        folder = tmp_path / f"{name}-{version}.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    assert audit.pinned(tmp_path) == ["a-b==1.0", "torch==2.9.0"]
+
+
+@pytest.mark.parametrize(
+    ("answers", "status", "said"),
+    [
+        (["no route", "no route"], 3, "nothing was audited"),
+        (["no route", {"dependencies": []}], 0, "asked for at osv: 0 known"),
+        ([{"dependencies": [{"name": "a", "version": "1", "vulns": [{"id": "X"}]}]}], 1, "a 1: X, mended in no version"),
+    ],
+)
+def test_the_audit_asks_one_service_after_another(
+    answers: list[object],
+    status: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "a-1.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: a\nVersion: 1\n")
+    waiting = list(answers)
+    monkeypatch.setattr(audit, "ask", lambda *_: waiting.pop(0))
+    monkeypatch.setattr(sys, "argv", ["audit.py", "--path", str(tmp_path)])
+    assert audit.main() == status and not waiting
+    out, error = capsys.readouterr()
+    assert said in out + error
+    monkeypatch.setattr(sys, "argv", ["audit.py", "--path", str(tmp_path / "none")])
+    assert audit.main() == 2

@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.data.converters.coco_names import COCO_IDS, COCO_NAMES, HEIGHTS
+from nolbo_ppl.data.converters.foreign_fields import category_name, mask_of, numbers_of, score_of
 from nolbo_ppl.data.converters.kitti_tracking import car_rotation
-from nolbo_ppl.errors import InputError, input_error
-from nolbo_ppl.geometry.masks import MaskMoments, mask_moments
+from nolbo_ppl.errors import input_error
+from nolbo_ppl.geometry.masks import MaskMoments
 from nolbo_ppl.io.fields import is_number, number_array
 from nolbo_ppl.io.files import read_json, read_jsonl
 from nolbo_ppl.io.images import natural
@@ -106,26 +107,6 @@ class _Row:
     mask: MaskMoments | None = None
 
 
-def _mask(value: Any, what: str, path: Path, line: int | None = None) -> MaskMoments | None:
-    """Moments of a mask. Raises `InputError` naming the file, and what it belongs to."""
-    if not value:
-        return None
-    try:
-        return mask_moments(value)
-    except InputError as error:
-        raise input_error(what, got=error, file=path, line=line) from None
-
-
-def _name(value: object, names: Sequence[str] | Mapping[int, str], where: dict[str, Any]) -> str:
-    """Name of a category given by name or number. Raises `InputError` for a number without a name."""
-    if isinstance(value, str):
-        return value.strip().replace(" ", "_")
-    try:
-        return names[int(value)].replace(" ", "_")  # type: ignore[call-overload]
-    except (KeyError, IndexError, TypeError, ValueError):
-        raise input_error("category without a name", got=value, do="give the names of the categories", **where) from None
-
-
 def _coco(path: Path, names: Mapping[int, str] | None) -> list[_Row]:
     content = read_json(path)
     images: dict[Any, str] = {}
@@ -137,15 +118,15 @@ def _coco(path: Path, names: Mapping[int, str] | None) -> list[_Row]:
     for k, item in enumerate(content):
         if item.get("iscrowd"):
             continue  # a crowd is no object
-        mask = _mask(item.get("segmentation"), f"segmentation of detection {k}", path)
+        mask = mask_of(item.get("segmentation"), f"segmentation of detection {k}", path)
         if item.get("bbox") is None and mask is not None:
             box = mask.box.tolist()
         else:
-            x, y, w, h = item["bbox"]
+            x, y, w, h = numbers_of(item["bbox"], 4, f"bbox of detection {k}", path)
             box = [x, y, x + w, y + h]
         image = images.get(item["image_id"], str(item["image_id"]))
-        category = _name(item.get("category_name", item.get("category_id")), names or COCO_IDS, {"file": path})
-        rows.append(_Row(image, box, float(item.get("score", 1.0)), category, mask=mask))
+        category = category_name(item.get("category_name", item.get("category_id")), names or COCO_IDS, {"file": path})
+        rows.append(_Row(image, box, score_of(item.get("score", 1.0), f"score of detection {k}", path), category, mask=mask))
     return rows
 
 
@@ -170,7 +151,7 @@ def read_lines(path: Path) -> list[_Row]:
             raise input_error("unknown field", got=unknown, expected=f"some of {sorted(LINE)}", **where)
         if item.get("position") is not None:
             raise input_error("a box with a position", expected="boxes alone", do="nolbo slam reads such lines itself", **where)
-        mask = _mask(item.get("mask"), "mask", path, number)
+        mask = mask_of(item.get("mask"), "mask", path, number)
         box = number_array(item.get("box"), (4,), 1e6) if item.get("box") is not None else None if mask is None else mask.box
         if box is None:
             raise input_error("no box", got=item.get("box"), expected="`box` [x0, y0, x1, y1] in px, or `mask`", **where)
@@ -190,9 +171,9 @@ def _oa_slam(path: Path, names: Sequence[str] | None) -> list[_Row]:
     return [
         _Row(
             str(image["file_name"]),
-            item["bbox"],
-            float(item["detection_score"]),
-            _name(item["category_id"], names or COCO_NAMES, {"file": path}),
+            numbers_of(item["bbox"], 4, f"bbox of a detection in {image['file_name']}", path),
+            score_of(item["detection_score"], f"detection_score of a detection in {image['file_name']}", path),
+            category_name(item["category_id"], names or COCO_NAMES, {"file": path}),
         )
         for image in read_json(path)
         for item in image["detections"]
@@ -216,7 +197,7 @@ def _yolo(folder: Path, names: Sequence[str] | None, size: tuple[int, int] | Non
                 )
             x, y, w, h = np.array(values[1:5]) * np.tile(size, 2)
             score = values[5] if len(values) == 6 else 1.0
-            category = _name(values[0], names or COCO_NAMES, where)
+            category = category_name(values[0], names or COCO_NAMES, where)
             rows.append(_Row(path.stem, [x - w / 2, y - h / 2, x + w / 2, y + h / 2], score, category))
     return rows
 
@@ -265,16 +246,22 @@ def _omni3d(path: Path, names: Mapping[int, str] | None) -> list[_Row]:
         entries = [(images[item["image_id"]], item) for item in content["annotations"]]
     else:
         entries = [(str(image.get("file_path", image["image_id"])), item) for image in content for item in image["instances"]]
-    for image, item in entries:
-        category = _name(item.get("category_name", item.get("category", item.get("category_id"))), names or {}, {"file": path})
-        box = item.get("bbox2D_tight", item.get("bbox2D_proj"))
+    for k, (image, item) in enumerate(entries):
+        category = category_name(
+            item.get("category_name", item.get("category", item.get("category_id"))), names or {}, {"file": path}
+        )
+        given = item.get("bbox2D_tight", item.get("bbox2D_proj"))
+        box = None if given is None else numbers_of(given, 4, f"2D box of object {k}", path)
         if box is None or min(box) < 0:
-            x, y, w, h = item["bbox"]
+            x, y, w, h = numbers_of(item["bbox"], 4, f"bbox of object {k}", path)
             box = [x, y, x + w, y + h]
-        width, height, length = item["dimensions"]
-        R = np.array(item.get("R_cam", item.get("pose")), dtype=np.float64).reshape(3, 3)
-        score = float(item.get("score", 1.0))
-        rows.append(_Row(image, box, score, category, item["center_cam"], R @ to_canonical, [width, length, height]))
+        width, height, length = numbers_of(item["dimensions"], 3, f"dimensions of object {k}", path)
+        centre = numbers_of(item["center_cam"], 3, f"center_cam of object {k}", path)
+        R = number_array(item.get("R_cam", item.get("pose")), (3, 3), 2.0)
+        if R is None:
+            raise input_error(f"R_cam of object {k}", got=repr(item.get("R_cam"))[:80], expected="a rotation, 3 x 3", file=path)
+        score = score_of(item.get("score", 1.0), f"score of object {k}", path)
+        rows.append(_Row(image, box, score, category, centre, R @ to_canonical, [width, length, height]))
     return rows
 
 

@@ -79,8 +79,9 @@ def read_calibration(path: str | PathLike[str]) -> KittiCamera:
             P = np.array([float(word) for word in rest.split()]).reshape(3, 4)
         except ValueError:
             P = np.full((3, 4), np.nan)
-        if not np.isfinite(P).all() or min(P[0, 0], P[1, 1]) <= 0:
-            raise input_error("not a projection", got=repr(rest[:60]), expected="12 numbers", file=path, line=number)
+        if not np.isfinite(P).all() or np.abs(P).max() > 1e9 or min(P[0, 0], P[1, 1]) <= 0 or P[2, :3].tolist() != [0, 0, 1]:
+            expected = "12 numbers, K [I | t] by rows"
+            raise input_error("not a projection", got=repr(rest[:60]), expected=expected, file=path, line=number)
         return camera_of_projection(P)
     raise input_error("no projection of camera 2", expected="a line P2: and 12 numbers", file=path)
 

@@ -17,6 +17,7 @@ from nolbo_ppl.io.observations import read_observations
 CAMERA = np.array([500.0, 510.0, 320.0, 240.0])
 SIZE = (640, 480)
 BOXES = np.array([[100.0, 120, 220, 200], [300, 200, 330, 290], [400, 100, 500, 300]])
+OA_SLAM = '[{"file_name": "a", "detections": [{"bbox": %s, "category_id": %s, "detection_score": 1}]}]'
 SCORES = (0.9, 0.5, 0.75)
 CATEGORIES = ("car", "person", "chair")
 IMAGES = ("f10.png", "f2.png", "f2.png")  # natural order: f2 is frame 0
@@ -168,6 +169,20 @@ def test_the_command_writes_observations(tmp_path: Path, capsys: pytest.CaptureF
         ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [0, 0, 0, 1]}]', "box 0: got .*expected x0 < x1"),
         ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [0, 0, 1, 1], "score": 3}]', "score: got 3.0"),
         ("coco", '[{"image_id": 1}]', "not detections in the format coco: got KeyError"),
+        ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [true, 0, 1, 1]}]', "bbox of detection 0: got .*expected 4 numbers"),
+        ("coco", '[{"image_id": 1, "category_id": 1, "bbox": ["0", "0", "1", "1"]}]', "bbox of detection 0"),
+        ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [0, 0, 1, 1], "score": true}]', "score of detection 0: got True"),
+        ("coco", '[{"image_id": 1, "category_id": true, "bbox": [0, 0, 1, 1]}]', "category without a name: got True"),
+        (
+            "oa-slam",
+            '[{"file_name": "a", "detections": [{"bbox": [0, 0, 1], "category_id": 1, "detection_score": 1}]}]',
+            "bbox of",
+        ),
+        (
+            "oa-slam",
+            '[{"file_name": "a", "detections": [{"bbox": [0, 0, 1, 1], "category_id": -1, "detection_score": 1}]}]',
+            "got -1",
+        ),
         ("omni3d", '{"images": []}', "not detections in the format omni3d"),
         ("kitti", "Car 1 2\n", "a.json:1: not a KITTI label: got Car 1 2"),
     ],

@@ -118,6 +118,7 @@ def test_an_image_without_calibration(tmp_path: Path) -> None:
         (REGION, "P0: 1\n", r"no projection of camera 2"),
         (REGION, "P2: 1 2 3\n", r"not a projection"),
         (REGION, CALIB.replace("200", "-200"), r"not a projection"),
+        (REGION, CALIB.replace("0 0 1 0.02", "0 0 0 0.02"), r"not a projection"),
     ],
 )
 def test_errors(tmp_path: Path, label: str, calib: str, message: str) -> None:

@@ -14,15 +14,15 @@ from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeKeeper
 
 FACTOR_MEMORY = 0.006
 """MB of a factor with its share of poses, landmarks and iSAM2's cliques: measured, 34 MB at 4 600 factors and 6 400 keyframes."""
-POSE_MEMORY = 0.0005
-"""MB of the pose of a keyframe that is no longer in the graph."""
+POSE_MEMORY = 0.00017
+"""MB of the pose of a keyframe that is no longer in the graph (`hanging_poses`, with room for a quarter more)."""
 SHARE = 0.8
 """What is left of the bound's factors when ground is forgotten: one marginal covariance serves many keyframes."""
 
 
 def graph_memory(graph: IncrementalGraph) -> float:
     """Memory of the running graph, MB, by its numbers of factors and keyframes."""
-    return FACTOR_MEMORY * len(graph.factors) + POSE_MEMORY * len(graph.attached)
+    return FACTOR_MEMORY * len(graph.factors) + POSE_MEMORY * len(graph.hanging)
 
 
 def forget_oldest(graph: IncrementalGraph, loops: LoopCloser, keeper: KeyframeKeeper, frame: int, live: set[int]) -> int:
@@ -40,7 +40,7 @@ def forget_oldest(graph: IncrementalGraph, loops: LoopCloser, keeper: KeyframeKe
     bound = keeper.config.max_memory
     if bound is None or graph_memory(graph) <= bound:
         return 0
-    left = max(SHARE * (bound - POSE_MEMORY * len(graph.attached)) / FACTOR_MEMORY, 0.0)
+    left = max(SHARE * (bound - POSE_MEMORY * len(graph.hanging)) / FACTOR_MEMORY, 0.0)
     leaving: list[int] = []
     gone: set[int] = set()
     poses = sorted(graph.of_pose)
@@ -64,7 +64,5 @@ def forget_oldest(graph: IncrementalGraph, loops: LoopCloser, keeper: KeyframeKe
         for number in sorted(graph.of_landmark[j]):
             graph.remove(number)
     loops.forget(alone)
-    left_out = set(leaving)
-    keeper.condensed = [p for p in keeper.condensed if p not in left_out]
-    keeper.known = {t: n for t, n in keeper.known.items() if t not in left_out}
+    keeper.forget(set(leaving), first)
     return len(leaving)

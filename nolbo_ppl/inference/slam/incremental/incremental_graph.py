@@ -28,6 +28,7 @@ from nolbo_ppl.inference.slam.graph import (
     resolve_observations,
 )
 from nolbo_ppl.inference.slam.incremental.condensation import condensed_observations
+from nolbo_ppl.inference.slam.incremental.hanging_poses import HangingPoses
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 
@@ -95,8 +96,7 @@ class IncrementalGraph:
         self.serial = 0
         self.poses = 0
         self.landmarks = 0
-        self.attached: dict[int, tuple[int, Float[np.ndarray, "4 4"]]] = {}
-        self.carried: dict[int, list[int]] = {}
+        self.hanging = HangingPoses()
 
     # -- factors ------------------------------------------------------------------------------------------------------
 
@@ -254,15 +254,7 @@ class IncrementalGraph:
             T = T_onto @ self.pose(pose)
             for number in sorted(self.of_pose.get(pose, ())):
                 self.remove(number)
-            self._hang(pose, onto, T)
-
-    def _hang(self, pose: int, onto: int, T: Float[np.ndarray, "4 4"]) -> None:
-        """A pose, and what hangs on it, stands relative to another one from now on."""
-        for frame in self.carried.pop(pose, []):
-            self.attached[frame] = (onto, T @ self.attached[frame][1])
-            self.carried.setdefault(onto, []).append(frame)
-        self.attached[pose] = (onto, T)
-        self.carried.setdefault(onto, []).append(pose)
+            self.hanging.hang(pose, onto, T)
 
     def _bridge(self, pose: int, onto: int) -> None:
         """Eliminate a pose that has steps alone: exact, but for its place, which is frozen relative to `onto`."""
@@ -273,7 +265,7 @@ class IncrementalGraph:
         for number in (before, after):
             if number is not None:
                 self.remove(number)
-        self._hang(pose, onto, T)
+        self.hanging.hang(pose, onto, T)
 
     # -- solving ------------------------------------------------------------------------------------------------------
 
@@ -341,8 +333,8 @@ class IncrementalGraph:
 
     def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
         """Pose of a keyframe; its first value while it waits."""
-        if frame in self.attached:
-            onto, T = self.attached[frame]
+        if frame in self.hanging:
+            onto, T = self.hanging.root(frame)
             return self._value(pose_key(onto)) @ T
         return self._value(pose_key(frame))
 
@@ -356,21 +348,16 @@ class IncrementalGraph:
 
     def pose_covariance(self, frame: int) -> Float[np.ndarray, "6 6"]:
         """Covariance of a pose, [rotation rad, position m] in the camera's frame; that of the pose it hangs on, carried."""
-        if frame not in self.attached:
+        if frame not in self.hanging:
             return np.asarray(self.isam.marginalCovariance(pose_key(frame)))
-        onto, T = self.attached[frame]
+        onto, T = self.hanging.root(frame)
         carry = adjoint(inverse(T))
         return carry @ np.asarray(self.isam.marginalCovariance(pose_key(onto))) @ carry.T
 
     def trajectory(self) -> Float[np.ndarray, "n 4 4"]:
         """All poses."""
         values = self.isam.calculateEstimate()
-        out = np.empty((self.poses, 4, 4))
-        for i in range(self.poses):
-            onto, T = self.attached.get(i, (i, None))
-            pose = values.atPose3(pose_key(onto)).matrix()
-            out[i] = pose if T is None else pose @ T
-        return out
+        return self.hanging.places(self.poses, lambda i: values.atPose3(pose_key(i)).matrix())
 
     def landmarks_of(self, poses: Iterable[int]) -> set[int]:
         """Landmarks observed from the given poses."""

@@ -15,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from nolbo_ppl.errors import InputError, input_error
+from nolbo_ppl.errors import InputError, input_error, located
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.graph import GraphError
 from nolbo_ppl.inference.slam.incremental.drift_graph import DriftGraph
+from nolbo_ppl.inference.slam.incremental.hanging_poses import HangingPoses
 from nolbo_ppl.inference.slam.incremental.incremental_calibration import IncrementalCalibration
 from nolbo_ppl.inference.slam.incremental.incremental_graph import Factor, IncrementalGraph
 from nolbo_ppl.inference.slam.incremental.incremental_loops import LoopCloser, Merge
@@ -25,6 +27,7 @@ from nolbo_ppl.inference.slam.incremental.incremental_memory import IncrementalM
 from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, KeyframeKeeper
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.running_map import MAX_FRAMES, RunningLandmark, RunningMap
+from nolbo_ppl.inference.slam.incremental.state_checks import check_links, typed_columns
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
@@ -83,6 +86,8 @@ def save_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
         "stretch": slam.keeper.stretch,
         "known": sorted(slam.keeper.known.items()),
         "condensed": slam.keeper.condensed,
+        "explored": sorted(set(slam.keeper.explored.values())),
+        "waiting": slam.keeper.waiting,
         "start": slam.keeper.start,
     }
     _put_history(slam, arrays, meta)
@@ -123,16 +128,13 @@ def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
             )
             slam.loops = _get_loops(slam, archive, meta)
             _get_tracks(slam, archive, meta)
-            keeper = KeyframeKeeper(slam.keyframes)
-            keeper.stretch, keeper.condensed = list(meta["keeper"]["stretch"]), list(meta["keeper"]["condensed"])
-            keeper.known = {int(t): int(n) for t, n in meta["keeper"]["known"]}
-            keeper.start = int(meta["keeper"]["start"])
-            slam.keeper = keeper
             _get_history(slam, archive, meta)
             slam.graph = _get_graph(archive, meta)
-        except InputError:
-            raise
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            slam.keeper = _get_keeper(slam, meta["keeper"])
+            check_links(slam)
+        except InputError as error:
+            raise error if str(path) in str(error) else located(error, path) from None
+        except (GraphError, KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError) as error:
             raise input_error("not a saved online system", got=f"{type(error).__name__}: {error}", file=path) from None
 
 
@@ -151,9 +153,9 @@ def _put_graph(graph: IncrementalGraph, arrays: dict[str, Any], meta: dict[str, 
     point = graph.isam.getLinearizationPoint()
     arrays["graph/key"] = np.array(keys, dtype=np.uint64)
     arrays["graph/value"] = np.array([point.atPose3(k).matrix() for k in keys]).reshape(-1, 4, 4)
-    attached = sorted(graph.attached.items())
-    arrays["graph/attached"] = np.array([(t, onto) for t, (onto, _) in attached], dtype=np.int64).reshape(-1, 2)
-    arrays["graph/attached_T"] = np.array([T for _, (_, T) in attached]).reshape(-1, 4, 4)
+    hanging = graph.hanging.numbers()
+    arrays["graph/attached"] = np.stack([hanging, graph.hanging.onto[hanging]], axis=1)
+    arrays["graph/attached_T"] = graph.hanging.T[hanging]
     meta["graph"] = {"careful": graph.careful, "serial": graph.serial, "poses": graph.poses, "landmarks": graph.landmarks}
 
 
@@ -167,14 +169,28 @@ def _get_graph(archive: Npz, meta: dict[str, Any]) -> IncrementalGraph:
     values = archive.array("graph/value", (len(keys), 4, 4))
     attached = archive.array("graph/attached", (None, 2), kinds="i")
     places = archive.array("graph/attached_T", (len(attached), 4, 4))
-    for (frame, onto), pose in zip(attached.tolist(), places):
-        graph.attached[frame] = (onto, pose)
-        graph.carried.setdefault(onto, []).append(frame)
     for name in ("serial", "poses", "landmarks"):
         setattr(graph, name, int(meta["graph"][name]))
+    if graph.poses > len(attached) + len(keys):
+        raise ValueError(f"{graph.poses} poses, {len(attached) + len(keys)} known")
+    graph.hanging = HangingPoses.of_links(attached[:, 0], attached[:, 1], places, graph.poses)
     graph.careful = bool(meta["graph"]["careful"])
     graph.restart(dict(zip(keys.tolist(), values)))
     return graph
+
+
+def _get_keeper(slam: IncrementalMemory, stored: dict[str, Any]) -> KeyframeKeeper:
+    keeper, poses = KeyframeKeeper(slam.keyframes), slam.graph.of_pose
+    keeper.stretch, keeper.condensed = list(stored["stretch"]), list(stored["condensed"])
+    keeper.known = {int(t): int(n) for t, n in stored["known"]}
+    keeper.start = int(stored["start"])
+    explored, keeper.waiting = ([int(first) for first in stored.get(name, ())] for name in ("explored", "waiting"))
+    for first in (*explored, *keeper.waiting):
+        if not all(p in poses for p in range(first, first + slam.keyframes.stretch)):
+            raise ValueError(f"a stretch from {first} that is not in the graph")
+    for first in explored:
+        keeper.explore(first)
+    return keeper
 
 
 # -- map ----------------------------------------------------------------------------------------------------------------
@@ -189,10 +205,11 @@ def _put_landmarks(prefix: str, landmarks: list[RunningLandmark], arrays: dict[s
     arrays[f"{prefix}/frames"] = frames
 
 
-def _get_landmarks(prefix: str, archive: Npz) -> list[RunningLandmark]:
+def _get_landmarks(prefix: str, archive: Npz, prior: FeaturePrior) -> list[RunningLandmark]:
     frames = archive.array(f"{prefix}/frames", (None, MAX_FRAMES), kinds="i")
-    names = (*LANDMARK_ARRAYS, *LANDMARK_NUMBERS)
-    columns = {name: archive.array(f"{prefix}/{name}", kinds="fib") for name in names}
+    if not len(frames):
+        return []
+    columns = typed_columns(archive, prefix, (*LANDMARK_ARRAYS, *LANDMARK_NUMBERS), len(frames), prior)
     out = []
     for row in range(len(frames)):
         values = {name: columns[name][row].copy() for name in LANDMARK_ARRAYS}
@@ -227,7 +244,7 @@ def _put_loops(loops: LoopCloser, arrays: dict[str, Any], meta: dict[str, Any]) 
 
 def _get_loops(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> LoopCloser:
     running = RunningMap(slam.prior)
-    landmarks = _get_landmarks("landmark", archive)
+    landmarks = _get_landmarks("landmark", archive, slam.prior)
     running.landmarks = {j.number: j for j in landmarks}
     running.numbers = np.array([j.number for j in landmarks], dtype=np.int64)
     running.position = archive.array("landmark/position", (len(landmarks), 3))
@@ -280,21 +297,30 @@ def _put_tracks(slam: IncrementalMemory, arrays: dict[str, Any], meta: dict[str,
 
 def _get_tracks(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> None:
     tracker = slam.new_tracker()
-    for name in TRACKER_ARRAYS:
-        setattr(tracker, name, archive.array(f"tracker/{name}", kinds="fib"))
-    tracker.modes = OrientationModes(*(archive.array(f"tracker/modes/{name}", finite=False) for name in MODES))
+    tracker.index = archive.array("tracker/index", (None,), kinds="i")
+    for name, value in typed_columns(archive, "tracker", TRACKER_ARRAYS, len(tracker.index), slam.prior).items():
+        setattr(tracker, name, value)
+    tracker.modes = _get_modes(archive, "tracker/modes", len(tracker.index))
     tracker.total = int(meta["tracks"]["total"])
     slam.tracker = tracker
-    drafts = _get_landmarks("draft", archive)
+    drafts = _get_landmarks("draft", archive, slam.prior)
     slam.tracks = {int(n): LiveTrack(int(j), draft, [], int(last)) for (n, j, last), draft in zip(meta["tracks"]["live"], drafts)}
     waiting = meta["tracks"]["waiting"]
-    columns = {name: archive.array(f"measurement/{name}", kinds="fib") for name in MEASUREMENTS}
-    modes = OrientationModes(*(archive.array(f"measurement/modes/{name}", finite=False) for name in MODES))
+    if not waiting:
+        return
+    columns = typed_columns(archive, "measurement", MEASUREMENTS, len(waiting), slam.prior)
+    modes = _get_modes(archive, "measurement/modes", len(waiting))
     for row, (number, frame) in enumerate(waiting):
         part = slice(row, row + 1)
         own = OrientationModes(modes.log_weight[part], modes.R[part], modes.scale[part])
         measurement = Measurements(**{name: columns[name][part] for name in MEASUREMENTS}, modes=own)
         slam.tracks[int(number)].waiting.append((int(frame), measurement))
+
+
+def _get_modes(archive: Npz, prefix: str, rows: int) -> OrientationModes:
+    weight = archive.array(f"{prefix}/log_weight", (rows, None), kinds="f", finite=False)
+    R = archive.array(f"{prefix}/R", (*weight.shape, 3, 3), kinds="f")
+    return OrientationModes(weight, R, archive.array(f"{prefix}/scale", weight.shape, kinds="f"))
 
 
 # -- history ------------------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 """Which keyframes the running graph keeps: all of new ground, one of every few on known ground, and not without end.
 
-Keyframes behind the window in which mapped landmarks were met again are condensed, ten to one (`IncrementalGraph.condense`).
-A place driven past many times keeps its newest passes; what older ones said of the landmarks is then forgotten, which leaves
-the map a little less certain than it could be, never more. Those that first explored a place are always kept.
+Keyframes behind the window in which mapped landmarks were met again are condensed, ten to one (`IncrementalGraph.condense`), and
+with them those that first explored the place. A place driven past many times keeps its first pass and its newest ones; what those
+between said of the landmarks is forgotten, which leaves the map a little less certain than it could be, never more.
 """
 
 from __future__ import annotations
@@ -52,7 +52,20 @@ class KeyframeKeeper:
         self.stretch: list[int] = []
         self.known: dict[int, int] = {}
         self.condensed: list[int] = []
+        self.explored: dict[int, int] = {}  # keyframes of new ground: the first one of their stretch
+        self.waiting: list[int] = []  # such stretches that were driven past again
         self.start = 0
+
+    def explore(self, first: int) -> None:
+        """Note a stretch of new ground by its first keyframe."""
+        self.explored |= dict.fromkeys(range(first, first + self.config.stretch), first)
+
+    def forget(self, poses: set[int], first: int) -> None:
+        """Keyframes that have left the graph; the first one that stays holds a prior and is not condensed."""
+        self.condensed = [p for p in self.condensed if p not in poses]
+        self.known = {t: n for t, n in self.known.items() if t not in poses}
+        self.explored = {p: start for p, start in self.explored.items() if start > first}
+        self.waiting = [start for start in self.waiting if start > first]
 
     def restart(self, frame: int) -> None:
         """Another drive begins at this keyframe: the window of the last one stays as it is."""
@@ -69,15 +82,30 @@ class KeyframeKeeper:
             return
         self.stretch.append(leaving)
         if len(self.stretch) < self.config.stretch:
+            if self.waiting:  # one a keyframe: each is a small solve of its own
+                graph.condense(list(range(start := self.waiting.pop(0), start + self.config.stretch)))
             return
         stretch, self.stretch = self.stretch, []
         seen = [self.known.pop(t, 0) for t in stretch]
         if sum(1 for s in seen if s) < self.config.least_met or sum(seen) < self.config.least_met * 2:
+            self.explore(stretch[0])
             return
         graph.condense(stretch)
         anchor = stretch[len(stretch) // 2]
         self.condensed.append(anchor)
+        self._pass_again(anchor, graph)
         self._forget(anchor, graph)
+
+    def _pass_again(self, newest: int, graph: IncrementalGraph) -> None:
+        """Stretches of new ground that saw enough of the landmarks seen from the newest anchor are to be condensed."""
+        shared: dict[int, int] = {}
+        for j in graph.landmarks_of([newest]):
+            for start in {self.explored[p] for p in graph.watchers(j) if p in self.explored}:
+                shared[start] = shared.get(start, 0) + 1
+        for start in sorted(start for start, count in shared.items() if count >= self.config.least_met):
+            self.waiting.append(start)
+            for pose in range(start, start + self.config.stretch):
+                del self.explored[pose]
 
     def _forget(self, newest: int, graph: IncrementalGraph) -> None:
         """While the landmarks seen from the newest anchor have too many of them, the oldest goes."""

@@ -122,7 +122,7 @@ def test_condensing_keeps_what_is_known() -> None:
     small.drop(10, 20)
     small.settle()
     assert sorted(small.of_pose) == [*range(5), 20, *range(25, 30)]
-    assert small.attached[12][0] == 20 and np.isfinite(small.trajectory()).all()
+    assert small.hanging.root(12)[0] == 20 and np.isfinite(small.trajectory()).all()
 
 
 def test_steps_compose_as_sampled_motions_do() -> None:

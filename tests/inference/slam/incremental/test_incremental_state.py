@@ -65,7 +65,33 @@ def test_files_of_another_kind_are_refused(halfway: tuple[SimulatedSequence, Inc
         IncrementalSlam.load(other)
     with Npz(path) as archive:
         arrays = {name: archive.array(name, kinds="fiubU", finite=False) for name in archive.names}
-    for name, value in (("graph/T", arrays["graph/T"][:-1]), ("meta", np.array("{}")), ("prior/mean", np.array([np.nan]))):
+    meta = json.loads(str(arrays["meta"]))
+    hanging, factors = arrays["graph/attached"].copy(), arrays["graph/factor"].copy()
+    hanging[0, 1] = hanging[0, 0]  # hangs on itself
+    factors[3, 2] = 10**6
+    meta["keyframes"]["stretch"] = 0
+
+    def told(**changes: object) -> np.ndarray:
+        return np.array(json.dumps(json.loads(str(arrays["meta"])) | changes))
+
+    changed = (
+        ("graph/T", arrays["graph/T"][:-1]),
+        ("graph/attached", hanging),
+        ("graph/factor", factors),
+        ("graph/covariance", -arrays["graph/covariance"]),
+        ("landmark/votes", arrays["landmark/votes"][:, :-1]),
+        ("landmark/place", arrays["landmark/place"] + 10**6),
+        ("landmark/number", arrays["landmark/number"] + 10**6),
+        ("tracker/mean", arrays["tracker/mean"][:, :2]),
+        ("prior/mean", np.array([np.nan])),
+        ("meta", np.array("{}")),
+        ("meta", told(frames=10**7)),
+        ("meta", told(keyframes=meta["keyframes"])),
+        ("meta", told(loops=meta["loops"] | {"merged": [[0, 1], [1, 0]]})),
+        ("meta", told(keeper=meta["keeper"] | {"explored": [10**12]})),
+        ("meta", told(drift=meta["drift"] | {"standing": [99] * len(meta["drift"]["standing"])})),
+    )
+    for name, value in changed:
         save_npz(other, arrays | {name: value})
         with pytest.raises(InputError, match=r"other\.npz"):
             IncrementalSlam.load(other)

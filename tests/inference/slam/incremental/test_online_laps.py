@@ -55,9 +55,10 @@ def test_one_landmark_an_object_and_no_growth(
     assert infos[-1].landmarks <= 1.1 * objects
     assert sum(info.met for info in infos[-PER_LAP:]) >= 0.8 * objects
     poses = [infos[(lap + 1) * PER_LAP - 1].keyframes for lap in range(LAPS)]
-    # A lap adds its 50 keyframes and some 200 detections; on known ground almost none of them stay.
-    assert poses[3] - poses[2] <= 3 and poses[3] < 1.8 * PER_LAP
-    assert factors[3] - factors[2] < 0.1 * factors[2]
+    # A lap adds its 50 keyframes and some 200 detections; on known ground almost none of them stay, and what the first lap left
+    # is condensed too once it is driven past again.
+    assert poses[3] - poses[2] <= 3 and poses[3] < 1.1 * PER_LAP
+    assert factors[3] - factors[2] < 0.1 * factors[2] and max(factors) < 1.2 * factors[0]
     assert len(slam.loops.drift.gaps) < 1.5 * PER_LAP / slam.loops.drift.stride + 3
     assert len(slam.tracks) < OBJECTS
 
@@ -69,9 +70,9 @@ def test_the_trajectory_is_corrected_while_driving(
     before = absolute_trajectory_error(drive.odometry, drive.truth).rmse
     assert absolute_trajectory_error(slam.trajectory(), drive.truth).rmse < 0.3 * before
     # Frames of forgotten keyframes hang on one of the same place, not on what is far away by now.
-    graph = slam.graph
-    gone = [t for t in graph.attached if t not in range(slam.frames - 30, slam.frames)]
-    far = [np.linalg.norm(graph.attached[t][1][:3, 3]) for t in gone]
+    hanging = slam.graph.hanging
+    gone = [t for t in hanging.numbers().tolist() if t not in range(slam.frames - 30, slam.frames)]
+    far = [np.linalg.norm(hanging.root(t)[1][:3, 3]) for t in gone]
     assert len(gone) > PER_LAP and max(far) < 25.0
     now = infos[-1].T_world_camera[:3, 3]
     assert np.linalg.norm(now - drive.truth[-1, :3, 3]) < 0.5
