@@ -1,9 +1,10 @@
 """The online system lap after lap round the same objects: cost of a keyframe, memory, landmarks, and the trajectory.
 
-    python benchmarks/online.py [--laps 6] [--radius 150] [--objects 300] [--seeds 1] [--no-history] [--no-batch]
+    python benchmarks/online.py [--laps 6] [--radius 150] [--objects 300] [--seeds 1] [--no-history] [--no-batch] [--every 1]
 
-Prints a row at the end of every lap and one of the whole for each seed; `--out` writes them as JSON. Times are CPU ms of this
-process, the first keyframe (which calibrates) left out; memory is what the process holds more than before the first one.
+Prints a row at the end of every lap (or every few) and one of the whole for each seed; `--out` writes them as JSON. Times are CPU
+ms of this process, the first keyframe (which calibrates) left out; memory is what the process holds more than before the first
+one. `growth` is the mean of a lap over that of the last quarter of the first one, where the ground is still new.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ class Arguments:
     """Keep all detections, for the final map."""
     batch: bool = True
     """Also the final map and the batch, for their errors."""
+    every: int = 1
+    """Laps between two rows."""
     out: Path | None = None
     """JSON file for the rows."""
 
@@ -87,7 +90,8 @@ def drive_laps(arguments: Arguments, seed: int) -> tuple[list[Row], Row]:
         latency.append(1e3 * (time.process_time() - start))
         if t == 0:
             before = resident()
-        if (t + 1) % arguments.frames_per_lap == 0:
+        lap_number = (t + 1) // arguments.frames_per_lap
+        if (t + 1) % arguments.frames_per_lap == 0 and (lap_number == 1 or lap_number % arguments.every == 0):
             lap = np.array(latency[max(t + 1 - arguments.frames_per_lap, 1) :])
             rows.append(
                 {
@@ -95,6 +99,7 @@ def drive_laps(arguments: Arguments, seed: int) -> tuple[list[Row], Row]:
                     "mean": float(lap.mean()),
                     "p99": float(np.percentile(lap, 99)),
                     "max": float(lap.max()),
+                    "growth": float(lap.mean() / np.mean(latency[3 * arguments.frames_per_lap // 4 : arguments.frames_per_lap])),
                     "memory": resident() - before,
                     "landmarks": info.landmarks,
                     "objects": len(seen - {-1}),

@@ -24,7 +24,7 @@ def halfway(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedSequence
     drive = simulate_sequence(truth, rng, world=WorldConfig(objects=20, categories=5, latent_dim=4))
     table = drive.observations
     slam = IncrementalSlam(CONFIG, SlamProblem(drive.odometry[:50], table.select(table.frame < 50)))
-    for t in range(80):
+    for t in range(81):  # one stretch is condensed, those that explored its place wait
         slam.update(drive.odometry[t], table.select(table.frame == t))
     path = tmp_path_factory.mktemp("online") / "state.npz"
     slam.save(path)
@@ -36,7 +36,8 @@ def test_what_is_loaded_goes_on_bit_for_bit(halfway: tuple[SimulatedSequence, In
     with Npz(path) as archive:  # settings under the names that files of 0.1.0 have
         assert "new_rate" in json.loads(str(archive.array("meta", (), kinds="U")))["config"]
     again, table = IncrementalSlam.load(path), drive.observations
-    for t in range(80, 100):
+    assert slam.keeper.waiting and slam.keeper.explored and slam.keeper.condensed
+    for t in range(81, 100):
         rows = table.select(table.frame == t)
         one, other = slam.update(drive.odometry[t], rows), again.update(drive.odometry[t], rows)
         np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
@@ -112,9 +113,9 @@ def test_the_map_of_yesterday_is_the_prior_of_today(halfway: tuple[SimulatedSequ
     for t in range(20, 70):
         info = slam.update(inverse(drive.odometry[20]) @ drive.odometry[t], table.select(table.frame == t))
         met += info.met
-    assert info.frame == 129 and met >= 10 and info.landmarks <= 1.1 * before
+    assert info.frame == 130 and met >= 10 and info.landmarks <= 1.1 * before
     assert np.linalg.norm(info.T_world_camera[:3, 3] - drive.truth[69, :3, 3]) < 0.6
-    assert slam.trajectory().shape == (130, 4, 4)
+    assert slam.trajectory().shape == (131, 4, 4)
     with pytest.raises(InputError, match="several drives"):
         slam.finish()
     slam.save(path.with_name("twice.npz"))
