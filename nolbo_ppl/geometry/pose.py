@@ -160,8 +160,11 @@ def se3_log(T: Float[np.ndarray, "... 4 4"]) -> Float[np.ndarray, "... 6"]:
 
 
 def rotation_angle(R: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, " ..."]:
-    """Geodesic angle of rotations in rad, `||log R||_F / sqrt 2`, accurate near zero and near pi."""
-    return np.asarray(np.linalg.norm(so3_log(R), axis=-1))
+    """Geodesic angle of rotations in rad, `||log R||_F / sqrt 2`, by sine and cosine: accurate near zero and near pi."""
+    R = np.asarray(R, dtype=np.float64)
+    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    cosine = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0  # twice, as the sine
+    return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), cosine))
 
 
 def mean_rotation(R: Float[np.ndarray, "n 3 3"], weights: Float[np.ndarray, " n"] | None = None) -> np.ndarray:

@@ -88,3 +88,11 @@ def test_the_adjoint_carries_a_twist() -> None:
     carried = np.einsum("nij,nj->ni", adjoint(T), xi)
     np.testing.assert_allclose(T @ se3_exp(xi) @ inverse(T), se3_exp(carried), atol=1e-12)
     np.testing.assert_array_equal(adjoint(T[0]), adjoint(T)[0])
+
+
+def test_angles_are_those_of_the_rotation_vectors() -> None:
+    rng = np.random.default_rng(4)
+    axis = rng.standard_normal((8, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    angle = np.array([0.0, 1e-9, 1e-4, 0.3, 2.0, 3.1, np.pi - 1e-6, np.pi])
+    np.testing.assert_allclose(rotation_angle(so3_exp(angle[:, None] * axis)), angle, rtol=1e-9, atol=1e-12)

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import so3_exp, so3_log
+from nolbo_ppl.geometry.pose import rotation_angle, so3_exp, so3_log
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.io.observations import Detections
 
@@ -184,11 +184,11 @@ def _turned(
         return aligned[:, None], log_density[:, None]
     turns = vertical_turns(order)
     rotations = observed[:, None] @ turns[None]
-    error = so3_log(np.swapaxes(predicted, 1, 2)[:, None] @ rotations)
+    error = rotation_angle(np.swapaxes(predicted, 1, 2)[:, None] @ rotations)
     s = scale[:, None]
     with np.errstate(divide="ignore"):
         log_share = np.log(turn_shares(order, len(turns), config))
-    return rotations, log_share - 0.5 * np.sum(error**2, axis=2) / s**2 - angle_log_normaliser(scale)[:, None]
+    return rotations, log_share - 0.5 * error**2 / s**2 - angle_log_normaliser(scale)[:, None]
 
 
 def orientation_log_density(

@@ -56,6 +56,8 @@ class Factor:
     """Its covariance, [rotation rad, position m]."""
     slot: int = -1
     """Where iSAM2 holds it; -1 while it waits."""
+    built: gtsam.NonlinearFactor | None = None
+    """As GTSAM has it, once it was asked for (`build_all`)."""
 
     def variables(self) -> tuple[int, ...]:
         """Keys of its variables."""
@@ -67,12 +69,22 @@ class Factor:
 
     def build(self) -> gtsam.NonlinearFactor:
         """As GTSAM has it."""
-        root = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-        keys, T = self.variables(), gtsam.Pose3(self.T)
-        if len(keys) == 1:
-            return gtsam.PriorFactorPose3(keys[0], T, model)
-        return gtsam.BetweenFactorPose3(keys[0], keys[1], T, model)
+        return build_all([self])[0]
+
+
+def build_all(factors: list[Factor]) -> list[gtsam.NonlinearFactor]:
+    """Factors as GTSAM has them, each made once: condensing asks again for those that were committed (half its time)."""
+    new = [f for f in factors if f.built is None]
+    if new:
+        roots = np.linalg.inv(np.linalg.cholesky(np.array([f.covariance for f in new])))
+        for factor, root in zip(new, roots):
+            model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+            keys, T = factor.variables(), gtsam.Pose3(factor.T)
+            if len(keys) == 1:
+                factor.built = gtsam.PriorFactorPose3(keys[0], T, model)
+            else:
+                factor.built = gtsam.BetweenFactorPose3(keys[0], keys[1], T, model)
+    return [f.built for f in factors]
 
 
 def compose(first: Factor, second: Factor) -> Factor:
@@ -229,8 +241,7 @@ class IncrementalGraph:
         ]
         T_pose = {p: self.pose(p) for p in poses}
         T_landmark = {f.b: self.landmark(f.b) for f in local if f.kind == OBSERVATION}
-        built = [f.build() for f in local]
-        fused = condensed_observations(built, T_pose, T_landmark, anchor)
+        fused = condensed_observations(build_all(local), T_pose, T_landmark, anchor)
         for number in numbers:
             if self.factors[number].kind == OBSERVATION:
                 self.remove(number)
@@ -277,9 +288,10 @@ class IncrementalGraph:
         """
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         needed: set[int] = set()
-        for number in self.added:
-            graph.add(self.factors[number].build())
-            needed.update(self.factors[number].variables())
+        added = [self.factors[number] for number in self.added]
+        for factor, built in zip(added, build_all(added)):
+            graph.add(built)
+            needed.update(factor.variables())
         for key, T in self.first_values.items():
             if key in needed:
                 values.insert(key, gtsam.Pose3(T))

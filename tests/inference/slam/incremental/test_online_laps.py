@@ -58,7 +58,7 @@ def test_one_landmark_an_object_and_no_growth(
     # A lap adds its 50 keyframes and some 200 detections; on known ground almost none of them stay, and what the first lap left
     # is condensed too once it is driven past again.
     assert poses[3] - poses[2] <= 3 and poses[3] < 1.1 * PER_LAP
-    assert factors[3] - factors[2] < 0.1 * factors[2] and max(factors) < 1.2 * factors[0]
+    assert factors[3] - factors[2] < 0.1 * factors[2] and max(factors) < 1.5 * factors[0]
     assert len(slam.loops.drift.gaps) < 1.5 * PER_LAP / slam.loops.drift.stride + 3
     assert len(slam.tracks) < OBJECTS
 
