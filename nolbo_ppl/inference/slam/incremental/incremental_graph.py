@@ -84,7 +84,7 @@ def build_all(factors: list[Factor]) -> list[gtsam.NonlinearFactor]:
                 factor.built = gtsam.PriorFactorPose3(keys[0], T, model)
             else:
                 factor.built = gtsam.BetweenFactorPose3(keys[0], keys[1], T, model)
-    return [f.built for f in factors]
+    return [f.built for f in factors if f.built is not None]  # all of them
 
 
 def compose(first: Factor, second: Factor) -> Factor:
