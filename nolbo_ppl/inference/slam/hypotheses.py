@@ -1,8 +1,9 @@
-"""Several maps where one is not sure: annealed runs from one start, compared by their log evidence.
+"""Several maps where one is not sure: runs from different starts, compared by their log evidence.
 
-Which loops an annealed run closes can depend on its samples and on how wide a drift it begins with. Each run differs from the
-first in both. Two that agree end the search; else up to `SlamConfig.hypotheses` of them run. Runs that end at one trajectory
-are one hypothesis; weights are the shares of the evidence.
+The first run anneals from the odometry. The second begins with the best whole association of the tracklets (`best_associations`),
+which is searched for quite otherwise. Two that agree end the search; else up to `SlamConfig.hypotheses` of them run: which
+loops an annealed run closes can depend on its samples and on how wide a drift it begins with, so further ones differ in both, and
+the next best association has its turn. Runs that end at one trajectory are one hypothesis; weights are the shares of the evidence.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import relative, se3_log
+from nolbo_ppl.inference.slam.best_associations import WholeAssociation, best_associations, with_association
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.graph import SlamEstimate, linearise
@@ -160,9 +162,16 @@ def explore(
 ) -> tuple[Run, tuple[MapHypothesis, ...]]:
     """The best of up to `SlamConfig.hypotheses` runs, and all distinct maps with their weights, best first."""
     runs: list[Run] = []
+    associations: list[WholeAssociation] = []
     same = SAME_MAP * 2 * state.link_scale
     for k in range(max(state.config.hypotheses, 1)):
-        runs.append(run_to_end(start_of_run(state, k), iterate, on_step))
+        if k == 1:
+            associations = best_associations(state, count=(state.config.hypotheses + 1) // 2)
+        if k % 2 and k // 2 < len(associations):
+            start = with_association(state, associations[k // 2])
+        else:
+            start = start_of_run(state, k - min((k + 1) // 2, len(associations)))
+        runs.append(run_to_end(start, iterate, on_step))
         if k == 0 and (raised := raised_odometry(state, runs[0].state)) is not None:
             # Loops were judged under a drift far too small: once more under what the map now says.
             state = raised
