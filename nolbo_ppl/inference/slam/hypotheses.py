@@ -1,9 +1,10 @@
 """Several maps where one is not sure: runs from different starts, compared by their log evidence.
 
-The first run anneals from the odometry. The second begins with the best whole association of the tracklets (`best_associations`),
-which is searched for quite otherwise. Two that agree end the search; else up to `SlamConfig.hypotheses` of them run: which
-loops an annealed run closes can depend on its samples and on how wide a drift it begins with, so further ones differ in both, and
-the next best association has its turn. Runs that end at one trajectory are one hypothesis; weights are the shares of the evidence.
+The first run anneals from the odometry. The second begins with the best whole association of the tracklets
+(`best_associations`), which is searched for quite otherwise. Two that agree end the search; else up to `SlamConfig.hypotheses` of
+them run: which loops an annealed run closes can depend on its samples and on how wide a drift it begins with, so further ones
+differ in both, and the next best association has its turn. Runs that end at one trajectory are one hypothesis; weights are the
+shares of the evidence.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The search for whole associations against every partition of a few tracklets, and on a drive whose annealed run goes wrong."""
 
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def enumerated(position, covariance, first, last, log_ratio):
         if any(root[r] != r for r in root):
             continue
         members = [[b for b in range(m) if root[b] == r] for r in set(root)]
-        if any(last[i] >= first[j] for group in members for i, j in zip(group, group[1:])):
+        if any(last[i] >= first[j] for group in members for i, j in pairwise(group)):
             continue
         pairs = [(a, r) for a, r in enumerate(root) if a != r]
         H = np.zeros((3 * len(pairs), len(full)))
