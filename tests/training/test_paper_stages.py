@@ -116,7 +116,7 @@ def test_every_stage_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "--stage multi" in card and "voxel_map" in card and "nolbo_ppl.load" in card
 
     again = dataclasses.replace(single, resume=True)
-    assert run_paper(again).held_out == pytest.approx(found.held_out, rel=1e-5)  # all done: the same networks
+    assert run_paper(again).held_out == pytest.approx(found.held_out, rel=1e-4)  # all done: the same networks, in 32 bits
 
 
 def test_a_stage_goes_on_where_its_checkpoint_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

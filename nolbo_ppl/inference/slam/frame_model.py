@@ -276,7 +276,7 @@ def estimate_frame_model(
     model = replace(
         model,
         detection_probability=probability.reshape(RANGES, AZIMUTHS),
-        clutter_share=np.clip(share, 1e-3, 0.97),
+        clutter_share=np.clip(share, 1e-3, 0.999),
         unmapped=float((new.sum() + PRIOR_COUNT) / (np.sum(expected_new * (1 - background)) + PRIOR_COUNT)),
         score_slope=slope,
         score_offset=offset,
