@@ -8,17 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
-from nolbo_ppl.geometry.pose import transform
 from nolbo_ppl.inference.slam.detection_pairs import detection_pairs
 from nolbo_ppl.inference.slam.existence import contribution, detected_log_odds, existence_log_odds, score_correlation
+from nolbo_ppl.inference.slam.exposures import exposures_of, exposures_of_places
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
-from nolbo_ppl.inference.slam.frame_model import (
-    PROBABILITY_LIMITS,
-    FrameModel,
-    estimate_frame_model,
-    exposures_of,
-    initial_frame_model,
-)
+from nolbo_ppl.inference.slam.frame_model import FrameModel, initial_frame_model
+from nolbo_ppl.inference.slam.frame_model_fit import estimate_frame_model
 from nolbo_ppl.inference.slam.graph import Linearisation
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
@@ -70,13 +65,12 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         rng: draws the posterior samples of relative positions.
     """
     seen, config = state.measurements, state.config
-    n, m = len(seen), len(state.estimate.T_world_landmark)
+    m = len(state.estimate.T_world_landmark)
     pairs = detection_pairs(state, linearisation, rng)
     model = state.frame_model or initial_frame_model(seen, config, len(state.problem))
     T_world_camera = state.estimate.T_world_camera
-    world = transform(T_world_camera[seen.frame], seen.position)
     of_landmark = exposures_of(model, T_world_camera, state.estimate.T_world_landmark[:, :3, 3])
-    of_detection = exposures_of(model, T_world_camera, world)
+    places = exposures_of_places(model, T_world_camera, seen)
     moving = moving_detections(state)
     log_odds, weight = np.full(m, 50.0), np.zeros(len(pairs))  # every landmark exists until the first E-step
     hit_cell = model.cell(pairs.local)
@@ -84,9 +78,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
     for _ in range(ROUNDS):
         score = model.log_score_ratio(seen)
         log_clutter = model.log_clutter(seen, log_density)
-        count, chance = of_detection.totals(model)
-        chance = np.clip(chance, *PROBABILITY_LIMITS)
-        log_once = model.log_pattern(np.ones(n), np.maximum(count, 1.0), chance) - np.log(chance)
+        log_once = places.log_only_here(model)
         log_once[moving] = 0.0  # it was elsewhere
         log_new = score + log_once + np.log(model.unmapped)
         log_new += np.log(model.birth_intensity) if model.birth_intensity is not None else model.log_objects(seen, log_density)
@@ -102,7 +94,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
         log_odds = existence_log_odds(state, pairs, weight, model, of_landmark, log_density)
         model = estimate_frame_model(
-            model, seen, background, new, np.exp(log_once), of_landmark, of_detection, hit_cell, weight, expit(log_odds), hits
+            model, seen, background, new, np.exp(log_once), of_landmark, places, hit_cell, weight, expit(log_odds), hits
         )
     listed = weight > LISTED
     return Associations(

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.inference.slam.detection_pairs import DetectionPairs
-from nolbo_ppl.inference.slam.frame_model import PROBABILITY_LIMITS, Exposures, FrameModel
+from nolbo_ppl.inference.slam.exposures import Exposures
+from nolbo_ppl.inference.slam.frame_model import PROBABILITY_LIMITS, FrameModel
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.slam_state import SlamState
 

@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections, rates_report
 from nolbo_ppl.inference.slam.em import make_landmark_equalities
-from nolbo_ppl.inference.slam.frame_model import exposures_of, initial_frame_model
+from nolbo_ppl.inference.slam.exposures import exposures_of
+from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.graph import LandmarkEqualities, linearise, optimize
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,

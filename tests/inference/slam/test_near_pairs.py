@@ -13,8 +13,9 @@ from nolbo_ppl.geometry.pose import inverse, se3_exp, transform
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, loop_candidates, near_pairs
 from nolbo_ppl.inference.slam import frame_marginals as frames_module
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, fit_prior
+from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
-from nolbo_ppl.inference.slam.frame_model import exposures_of, initial_frame_model
+from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.loop_candidates import PosteriorSamples, TrackletFeatures, candidate_pairs
 from nolbo_ppl.inference.slam.measurements import resolve

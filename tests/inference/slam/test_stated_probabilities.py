@@ -17,7 +17,8 @@ from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve,
 from nolbo_ppl.inference.slam.class_posterior import class_posterior, fit_confusion, votes_log_likelihood
 from nolbo_ppl.inference.slam.detection_features import fit_prior, latent_log_density
 from nolbo_ppl.inference.slam.detection_pairs import detection_pairs
-from nolbo_ppl.inference.slam.frame_model import exposures_of, initial_frame_model
+from nolbo_ppl.inference.slam.exposures import exposures_of
+from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.graph import linearise
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.measurements import resolve
