@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from nolbo_ppl.inference.slam.measurements import Measurements
 CHUNK_CELLS = 1 << 21
 """Numbers of a matrix of frames and points that are held at a time."""
 FEW = 10.0
-"""Places in view in fewer frames are known no better than their detection: there a miss more or less matters."""
+"""Places in view in fewer frames are averaged over: there a miss more or less matters."""
 NODES, NODE_WEIGHTS = np.array([-np.sqrt(3.0), 0.0, np.sqrt(3.0)]), np.array([1 / 6, 2 / 3, 1 / 6])
 """Gauss-Hermite nodes of a normal distribution, in standard deviations, and their weights."""
 
@@ -28,8 +29,8 @@ class Exposures:
     detections on twelve laps).
     """
 
-    count: Int[np.ndarray, "m c"]
-    """Frames in which each point is in each cell."""
+    count: Int[np.ndarray, "m c"] | Float[np.ndarray, "m c"]
+    """Frames in which each point is in each cell, or their expected number."""
 
     def totals(self, model: FrameModel) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Number of exposures of each point and its mean detection probability over them."""
@@ -59,41 +60,51 @@ def exposures_of(model: FrameModel, T_world_camera: Float[np.ndarray, "n 4 4"], 
 
 @dataclass(frozen=True)
 class PlaceExposures:
-    """Exposures of the places of single detections, each of which is known along its ray as well as it was measured.
+    """Exposures of the places of single detections, averaged over where they can be.
 
-    A place at the rim of the view, measured too far away, seems to be in view hardly ever else; but that an object was detected
-    there says that it stands where it can be (of 39 such detections in 120 worlds 12 were the only ones of their object).
+    A place at the rim of the view seems to be in view hardly ever else; but that an object was detected there says that it stands
+    where it can be. In 20 worlds without false detections 58 objects were seen once: measured places predict 82, the average
+    over the nodes in the plane of the view 59, over 40 samples of the whole covariance 65.
     """
 
+    middle: Exposures
+    """Exposures of the measured places."""
+    few: Int[np.ndarray, " f"]
+    """Detections whose place is in view in few frames."""
     node: tuple[Exposures, ...]
-    """Exposures at the nodes along the ray; the middle one alone where it is in view often."""
-    cell: Int[np.ndarray, "q n"]
+    """Exposures of nine nodes about each of these."""
+    cell: Int[np.ndarray, "9 f"]
     """Cell of each node in the frame of its detection, -1 out of view."""
-    spread: Float[np.ndarray, " n"]
-    """1 where the nodes differ, 0 where the middle one stands for all."""
 
-    def weights(self, model: FrameModel) -> Float[np.ndarray, "q n"]:
+    def weights(self, model: FrameModel) -> Float[np.ndarray, "9 f"]:
         """Posterior weight of each node: prior times the probability of having been detected there."""
-        probability = model.detection_probability.ravel()[np.maximum(self.cell, 0)] * (self.cell >= 0)
-        middle = (NODES == 0)[:, None]
-        weight = NODE_WEIGHTS[:, None] * probability * np.where(middle, 1.0, self.spread)
+        weight = np.outer(NODE_WEIGHTS, NODE_WEIGHTS).reshape(-1, 1)
+        weight = weight * model.detection_probability.ravel()[np.maximum(self.cell, 0)] * (self.cell >= 0)
         total = weight.sum(axis=0)
+        middle = (np.arange(9) == 4)[:, None]
         return np.where(total > 0, weight / np.maximum(total, 1e-300), middle)
 
     def log_only_here(self, model: FrameModel) -> Float[np.ndarray, " n"]:
         """Log probability that an object detected there is missed in all other frames."""
-        parts = []
-        for exposures, weight in zip(self.node, self.weights(model)):
-            count, chance = exposures.totals(model)
-            chance = np.clip(chance, *PROBABILITY_LIMITS)
-            missed = model.log_pattern(np.ones(len(count)), np.maximum(count, 1.0), chance) - np.log(chance)
-            parts.append(np.log(np.maximum(weight, 1e-300)) + missed)
-        return np.asarray(logsumexp(parts, axis=0))
+        out = _log_only_here(model, self.middle)
+        if len(self.few):
+            log_weight = np.log(np.maximum(self.weights(model), 1e-300))
+            parts = log_weight + np.array([_log_only_here(model, exposures) for exposures in self.node])
+            out[self.few] = logsumexp(parts, axis=0)
+        return out
 
     def mean(self, model: FrameModel) -> Exposures:
         """Expected exposures."""
-        weight = self.weights(model)
-        return Exposures(np.sum([w[:, None] * e.count for w, e in zip(weight, self.node)], axis=0))
+        count = self.middle.count.astype(np.float64)
+        if len(self.few):
+            count[self.few] = np.sum([w[:, None] * e.count for w, e in zip(self.weights(model), self.node)], axis=0)
+        return Exposures(count)
+
+
+def _log_only_here(model: FrameModel, exposures: Exposures) -> Float[np.ndarray, " n"]:
+    count, chance = exposures.totals(model)
+    chance = np.clip(chance, *PROBABILITY_LIMITS)
+    return model.log_pattern(np.ones(len(count)), np.maximum(count, 1.0), chance) - np.log(chance)
 
 
 def exposures_of_places(model: FrameModel, T_world_camera: Float[np.ndarray, "n 4 4"], seen: Measurements) -> PlaceExposures:
@@ -104,21 +115,18 @@ def exposures_of_places(model: FrameModel, T_world_camera: Float[np.ndarray, "n 
         T_world_camera: camera poses.
         seen: the detections, in camera frames.
     """
-    T = T_world_camera[seen.frame]
-    middle = exposures_of(model, T_world_camera, transform(T, seen.position))
+    middle = exposures_of(model, T_world_camera, transform(T_world_camera[seen.frame], seen.position))
     few = np.flatnonzero(middle.count.sum(axis=1) < FEW)
+    seen = seen.select(few)
+    T = T_world_camera[seen.frame]
     distance = np.maximum(np.linalg.norm(seen.position, axis=1, keepdims=True), 1e-9)
     ray = seen.position / distance
-    scale = np.sqrt(np.einsum("ni,nij,nj->n", ray, seen.covariance, ray))
+    across = np.stack([ray[:, 2], np.zeros(len(few)), -ray[:, 0]], axis=1)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    along_scale, across_scale = (np.sqrt(np.einsum("ni,nij,nj->n", u, seen.covariance, u))[:, None] for u in (ray, across))
     nodes, cells = [], []
-    for place in NODES:
-        position = ray * np.maximum(distance + place * scale[:, None], 0.05 * distance)
+    for along, aside in itertools.product(NODES, NODES):
+        position = ray * np.maximum(distance + along * along_scale, 0.05 * distance) + aside * across_scale * across
         cells.append(model.cell(position))
-        count = middle.count
-        if place != 0:
-            count = middle.count.copy()
-            count[few] = exposures_of(model, T_world_camera, transform(T[few], position[few])).count
-        nodes.append(Exposures(count))
-    spread = np.zeros(len(seen))
-    spread[few] = 1.0
-    return PlaceExposures(tuple(nodes), np.array(cells), spread)
+        nodes.append(exposures_of(model, T_world_camera, transform(T, position)))
+    return PlaceExposures(middle, few, tuple(nodes), np.array(cells).reshape(9, -1))
