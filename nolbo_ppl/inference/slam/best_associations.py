@@ -114,7 +114,7 @@ def best_associations(state: SlamState, count: int = 4) -> list[WholeAssociation
         state.features.last,
         tracklet_log_ratios(state),
         floor=state.link_scale,
-        log_new=float(np.log(state.noise.new_rate)),
+        log_new=float(np.log(state.noise.birth_intensity)),
         count=count,
     )
 

@@ -94,7 +94,7 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
         log_odds = existence_log_odds(state, pairs, weight, model, of_landmark, log_density)
         model = estimate_frame_model(
-            model, seen, background, new, np.exp(log_once), of_landmark, places, hit_cell, weight, expit(log_odds), hits
+            model, seen, background, new, np.exp(log_once), of_landmark, places.middle, hit_cell, weight, expit(log_odds), hits
         )
     listed = weight > LISTED
     return Associations(

@@ -29,8 +29,8 @@ class Exposures:
     detections on twelve laps).
     """
 
-    count: Int[np.ndarray, "m c"] | Float[np.ndarray, "m c"]
-    """Frames in which each point is in each cell, or their expected number."""
+    count: Int[np.ndarray, "m c"]
+    """Frames in which each point is in each cell."""
 
     def totals(self, model: FrameModel) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Number of exposures of each point and its mean detection probability over them."""
@@ -92,13 +92,6 @@ class PlaceExposures:
             parts = log_weight + np.array([_log_only_here(model, exposures) for exposures in self.node])
             out[self.few] = logsumexp(parts, axis=0)
         return out
-
-    def mean(self, model: FrameModel) -> Exposures:
-        """Expected exposures."""
-        count = self.middle.count.astype(np.float64)
-        if len(self.few):
-            count[self.few] = np.sum([w[:, None] * e.count for w, e in zip(self.weights(model), self.node)], axis=0)
-        return Exposures(count)
 
 
 def _log_only_here(model: FrameModel, exposures: Exposures) -> Float[np.ndarray, " n"]:

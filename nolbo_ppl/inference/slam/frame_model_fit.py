@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
 
-from nolbo_ppl.inference.slam.exposures import Exposures, PlaceExposures
+from nolbo_ppl.inference.slam.exposures import Exposures
 from nolbo_ppl.inference.slam.frame_model import AZIMUTHS, PROBABILITY_LIMITS, RANGES, FrameModel
 from nolbo_ppl.inference.slam.measurements import Measurements
 
@@ -35,7 +35,7 @@ def estimate_frame_model(
     new: Float[np.ndarray, " n"],
     expected_new: Float[np.ndarray, " n"],
     exposures: Exposures,
-    places: PlaceExposures,
+    places: Exposures,
     hit_cell: Int[np.ndarray, " p"],
     hit_weight: Float[np.ndarray, " p"],
     existence: Float[np.ndarray, " m"],
@@ -61,9 +61,8 @@ def estimate_frame_model(
     number, chance = exposures.totals(model)
     mapped = existence * _with_unseen(model, number, chance)
     seen = exposures.by_cell(mapped)
-    place_exposures = places.mean(model)
-    once = new * _with_unseen(model, *place_exposures.totals(model))
-    seen = seen + place_exposures.by_cell(once)
+    once = new * _with_unseen(model, *places.totals(model))
+    seen = seen + places.by_cell(once)
     hit = np.bincount(hit_cell[hit_cell >= 0], hit_weight[hit_cell >= 0], minlength=cells).astype(np.float64)
     own_cell = model.cell(measurements.position)
     hit += np.bincount(own_cell[own_cell >= 0], new[own_cell >= 0], minlength=cells)
