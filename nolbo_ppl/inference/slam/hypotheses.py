@@ -1,16 +1,17 @@
 """Several maps where one is not sure: runs from different starts, compared by their log evidence.
 
 The first run anneals from the odometry. The second begins with the best whole association of the tracklets
-(`best_associations`), which is searched for quite otherwise. Two that agree end the search; else up to `SlamConfig.hypotheses` of
-them run: which loops an annealed run closes can depend on its samples and on how wide a drift it begins with, so further ones
-differ in both, and the next best association has its turn. Runs that end at one trajectory are one hypothesis; weights are the
-shares of the evidence.
+(`best_associations`), which is searched for quite otherwise. Where the two agree, only associations that come near the best
+have a run too; else up to `SlamConfig.hypotheses` runs: which loops an annealed run closes can depend on its samples and on how
+wide a drift it begins with, so further ones differ in both, and the next best associations have their turns. Runs that end at one
+trajectory are one hypothesis; weights are the shares of the evidence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import count, islice
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +37,8 @@ SAME_SHARE = 0.3
 """Two runs whose trajectories are closer than this share of `SAME_MAP` agree whatever their evidence, ..."""
 SAME_COUNT = 0.05
 """... if their numbers of landmarks differ by no more than this share."""
+RIVAL = 5.0
+"""Whole associations less than this below the best have a run of their own even where two runs agree, nats."""
 AMBIGUOUS = 0.05
 """A rival with more weight than this makes the answer ambiguous."""
 RAISED = 3.0
@@ -156,6 +159,25 @@ def agree(first: Run, second: Run, distance: float, same: float) -> bool:
     return distance < SAME_SHARE * same and abs(counts[0] - counts[1]) <= SAME_COUNT * max(counts)
 
 
+def second_start(state: SlamState, associations: list[WholeAssociation]) -> SlamState:
+    """What the second run begins with: the best association, or another anneal where none was searched for."""
+    return with_association(state, associations[0]) if associations else start_of_run(state, 1)
+
+
+def further_starts(state: SlamState, associations: list[WholeAssociation], settled: bool) -> Iterator[SlamState]:
+    """Starts of the runs after the second: where the first two agree, associations that come near the best alone."""
+    if settled:
+        near = [one for one in associations[1:] if one.log_odds > associations[0].log_odds - RIVAL]
+        yield from (with_association(state, one) for one in near)
+        return
+    anneal = 1 if associations else 2
+    for turn in count(1):
+        yield start_of_run(state, anneal)
+        anneal += 1
+        if turn < len(associations):
+            yield with_association(state, associations[turn])
+
+
 def explore(
     state: SlamState,
     iterate: Callable[[SlamState, Callable[[SlamState, EmStepInfo], None]], tuple[SlamState, tuple[EmStepInfo, ...]]],
@@ -163,25 +185,19 @@ def explore(
 ) -> tuple[Run, tuple[MapHypothesis, ...]]:
     """The best of up to `SlamConfig.hypotheses` runs, and all distinct maps with their weights, best first."""
     runs: list[Run] = []
-    associations: list[WholeAssociation] = []
     same = SAME_MAP * 2 * state.link_scale
-    for k in range(max(state.config.hypotheses, 1)):
-        if k == 1:
-            associations = best_associations(state, count=(state.config.hypotheses + 1) // 2)
-        if k % 2 and k // 2 < len(associations):
-            start = with_association(state, associations[k // 2])
-        else:
-            start = start_of_run(state, k - min((k + 1) // 2, len(associations)))
-        runs.append(run_to_end(start, iterate, on_step))
-        if k == 0 and (raised := raised_odometry(state, runs[0].state)) is not None:
-            # Loops were judged under a drift far too small: once more under what the map now says.
-            state = raised
-            runs[0] = run_to_end(state, iterate, on_step)
-        distance = trajectory_distance(runs[0].state.estimate.T_world_camera, runs[-1].state.estimate.T_world_camera)
-        if k == 1 and agree(runs[0], runs[1], distance, same):
-            break
-        if len(state.static) < 2:
-            break
+    limit = max(state.config.hypotheses, 1)
+    runs.append(run_to_end(state, iterate, on_step))
+    if (raised := raised_odometry(state, runs[0].state)) is not None:
+        # Loops were judged under a drift far too small: once more under what the map now says.
+        state = raised
+        runs[0] = run_to_end(state, iterate, on_step)
+    if limit > 1 and len(state.static) > 1:
+        associations = best_associations(state, count=limit)
+        runs.append(run_to_end(second_start(state, associations), iterate, on_step))
+        distance = trajectory_distance(runs[0].state.estimate.T_world_camera, runs[1].state.estimate.T_world_camera)
+        settled = agree(runs[0], runs[1], distance, same)
+        runs += [run_to_end(start, iterate, on_step) for start in islice(further_starts(state, associations, settled), limit - 2)]
     if len(runs) > 2:  # and the map without any loop: runs that disagree may all be wrong
         runs.append(run_to_end(state, lambda start, _: (start, ()), None))
     runs.sort(key=lambda run: -run.log_evidence)

@@ -155,7 +155,8 @@ class SlamConfig:
     robust_width: float = 1.0
     """Width of the Cauchy kernel on links between tracklets, in standard deviations."""
     hypotheses: int = 4
-    """Most annealed runs from which the map is chosen by evidence; two that agree end the search. Each costs a whole run."""
+    """Most runs, from different starts, from which the map is chosen by evidence; two that agree without a rival end the search.
+    Each costs a whole run."""
     seed: int = 0
     """Seed of the posterior samples."""
     associator: Associator = "exact"
