@@ -1,13 +1,14 @@
 """The search for whole associations against every partition of a few tracklets, and on a drive whose annealed run goes wrong."""
 
-from itertools import pairwise, product
+from functools import partial
+from itertools import islice, pairwise, product
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
-from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve, solve_with_associations
+from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, hypotheses, solve, solve_with_associations
 from nolbo_ppl.inference.slam import best_associations as module
 from nolbo_ppl.inference.slam.best_associations import WholeAssociation, best_associations, search, with_association
 from nolbo_ppl.inference.slam.initialise import init
@@ -128,3 +129,16 @@ def test_long_drives_are_not_searched(lookalikes, monkeypatch):
     problem, _, stated = lookalikes
     monkeypatch.setattr(module, "MOST_TRACKLETS", 5)
     assert best_associations(init(problem, SlamConfig(**stated))) == []
+
+
+def test_starts_of_further_runs(monkeypatch):
+    """Agreed: what comes near the best alone. Not agreed: anneals and associations in turn, none twice, without end."""
+    monkeypatch.setattr(hypotheses, "with_association", lambda state, one: f"association {one.log_odds:g}")
+    monkeypatch.setattr(hypotheses, "start_of_run", lambda state, k: f"anneal {k}")
+    found = [WholeAssociation(np.zeros(1, int), odds) for odds in (10.0, 7.0, 4.0)]
+    starts = partial(hypotheses.further_starts, None)
+    assert hypotheses.second_start(None, found) == "association 10" and hypotheses.second_start(None, []) == "anneal 1"
+    assert list(starts(found, True)) == ["association 7"]
+    assert list(starts([], True)) == []
+    assert list(islice(starts(found, False), 5)) == ["anneal 1", "association 7", "anneal 2", "association 4", "anneal 3"]
+    assert list(islice(starts([], False), 3)) == ["anneal 2", "anneal 3", "anneal 4"]
