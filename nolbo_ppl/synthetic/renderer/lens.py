@@ -19,7 +19,7 @@ def motion_blurred(colour: Float[np.ndarray, "h w 3"], path: Float[np.ndarray, "
 
     Example:
         >>> one = np.zeros((1, 5, 3), np.float32); one[0, 2] = 1
-        >>> motion_blurred(one, np.array([2.0, 0.0]))[0, :, 0].round(2).tolist()
+        >>> motion_blurred(one, np.array([2.0, 0.0]))[0, :, 0].astype(float).round(2).tolist()
         [0.0, 0.33, 0.33, 0.33, 0.0]
     """
     length = float(np.linalg.norm(path))
