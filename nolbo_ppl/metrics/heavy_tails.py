@@ -57,8 +57,8 @@ def student_log_density(
     """Log density of Student's t from squared distances under its scale matrix S and `log |2 pi S|`.
 
     Example:
-        >>> round(float(student_log_density(np.array([0.0]), 0.0, 1e9)[0]), 6)  # the Gaussian's
-        0.0
+        >>> bool(abs(student_log_density(np.array([0.0]), 0.0, 1e9)[0]) < 1e-5)  # the Gaussian's
+        True
     """
     d = dimensions
     constant = gammaln((dof + d) / 2) - gammaln(dof / 2) - 0.5 * d * np.log(dof / 2)
