@@ -11,13 +11,9 @@ from scipy.special import expit, log_expit
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.inference.slam.detection_pairs import DetectionPairs
 from nolbo_ppl.inference.slam.existence import score_correlation
-from nolbo_ppl.inference.slam.frame_model import (
-    OFFSET_SCALE,
-    SLOPE_SCALE,
-    estimate_frame_model,
-    exposures_of,
-    initial_frame_model,
-)
+from nolbo_ppl.inference.slam.exposures import exposures_of
+from nolbo_ppl.inference.slam.frame_model import initial_frame_model
+from nolbo_ppl.inference.slam.frame_model_fit import OFFSET_SCALE, SLOPE_SCALE, estimate_frame_model
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 
