@@ -125,8 +125,8 @@ def pose_surfaces() -> list[Surface]:
         position_covariance=np.tile(0.01 * np.eye(3), (4, 1, 1)),
         rotation_scale=np.full(4, 0.1),
         latent_scale=np.full((4, 2), 0.7),
-        new_rate=1e-4,
-        clutter_rate=1e-4,
+        birth_intensity=1e-4,
+        clutter_intensity=1e-4,
         report={},
         warnings=(),
     )
@@ -182,7 +182,7 @@ def stream_surfaces() -> list[Surface]:
 
     def frames(path: Path) -> Any:
         found = VideoFile(path)
-        return [found.frame(k) for k in range(min(len(found), 5))], found.times()
+        return [found.frame(k) for k in range(min(len(found), 5))], found.times
 
     def poses(path: Path, first: bool) -> None:
         from rosbags.rosbag1 import Writer as Writer1

@@ -77,9 +77,9 @@ def _reading(path: Path, what: str) -> Iterator[None]:
     """Whatever damaged bytes make the reader run into becomes an `InputError` that names the bag."""
     try:
         yield
-    except (InputError, MemoryError):
+    except InputError:
         raise
-    except Exception as error:  # the reader raises errors of its own, of SQLite, of struct, of decompressors
+    except Exception as error:  # the reader raises errors of its own, of SQLite, of struct, of decompressors, of absurd lengths
         text = " ".join(str(error).split()) or type(error).__name__
         do = "was it cut short? `ros2 bag reindex` or `rosbag reindex` mend bags that were not closed"
         raise input_error(what, got=text, do=do, file=path) from None

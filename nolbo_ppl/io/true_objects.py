@@ -19,6 +19,10 @@ CLUTTER, UNKNOWN = -1, -2
 """In place of an object's number: a detection of nothing, and one of which nobody says what it is of."""
 
 
+BY_OBJECT = ("T_world_object", "categories", "latents")
+"""What the file tells by object."""
+
+
 @dataclass(frozen=True)
 class TrueObjects:
     """The truth about detections and objects."""
@@ -51,9 +55,10 @@ def read_true_objects(path: str | PathLike[str], ids: Sequence[str]) -> TrueObje
         raise input_error("true objects", expected="`objects`: a name or null by detection", file=path)
     if len(ids) and not any(name in objects for name in ids):
         raise input_error("true objects of other detections", got=list(objects)[:3], expected=list(ids)[:3], file=path)
-    poses = value.get("T_world_object") or {}
-    categories = value.get("categories") or {}
-    latents = value.get("latents") or {}
+    poses, categories, latents = (value.get(name) or {} for name in BY_OBJECT)
+    for name, part in zip(BY_OBJECT, (poses, categories, latents)):
+        if not isinstance(part, dict):
+            raise input_error(f"`{name}` of true objects", got=repr(part)[:80], expected="values by object", file=path)
     names = sorted({x for x in objects.values() if x is not None} | set(poses))
     number = {name: k for k, name in enumerate(names)}
     of = [number[objects[i]] if objects.get(i) is not None else (CLUTTER if i in objects else UNKNOWN) for i in ids]

@@ -43,6 +43,9 @@ def test_what_is_known_is_read_and_the_rest_is_left_open(tmp_path: Path) -> None
         ({"T_world_object": {"o1": [[1, 2]]}}, "pose of object 'o1'"),
         ({"T_world_object": {"o1": (2 * np.eye(4)).tolist()}}, "rigid motion"),
         ({"latents": {"o1": [1.0], "o0": [1.0, 2.0]}}, "one length"),
+        ({"categories": 1.5}, "`categories` of true objects: got 1.5"),
+        ({"T_world_object": [[1]]}, "`T_world_object` of true objects"),
+        ({"latents": "x"}, "`latents` of true objects"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

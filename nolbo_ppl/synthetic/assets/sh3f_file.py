@@ -11,14 +11,13 @@ import os
 import posixpath
 import re
 import zipfile
-import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from nolbo_ppl.categories import CATEGORIES
-from nolbo_ppl.errors import input_error
+from nolbo_ppl.errors import NolboError, input_error
 from nolbo_ppl.io.files import existing_file
 from nolbo_ppl.synthetic.assets.cad_mesh import mesh_to_shape
 from nolbo_ppl.synthetic.assets.face_colours import obj_colours
@@ -93,8 +92,9 @@ def load_sh3f(
     try:
         with zipfile.ZipFile(file) as archive:
             shapes = list(_shapes(archive, file, CATEGORIES if categories is None else categories, max_faces))
-    # damaged, encrypted, packed in another way
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError) as error:
+    except NolboError:
+        raise
+    except Exception as error:  # damaged, encrypted, packed in another way: zipfile and zlib raise what they run into
         raise input_error("not a furniture library", got=error, expected="a ZIP archive with a catalogue", file=file) from None
     if not shapes:
         raise input_error("no model of the wanted categories", expected=", ".join(sorted(WORDS)), file=file)

@@ -188,6 +188,12 @@ def test_damaged_libraries_are_refused(tmp_path: Path) -> None:
     torn.write_bytes(data)
     with pytest.raises(InputError, match="not a furniture library"):
         load_cad_folder(torn)
+    data = bytearray(library(tmp_path / "shifted.sh3f", CATALOGUE).read_bytes())
+    start = int.from_bytes(data[-6:-2], "little") + 100  # the catalogue of the archive: entries then begin before the file does
+    data[-6:-2] = start.to_bytes(4, "little")
+    torn.write_bytes(data)
+    with pytest.raises(InputError, match="not a furniture library"):
+        load_cad_folder(torn)
     with zipfile.ZipFile(tmp_path / "empty.sh3f", "w") as archive:
         archive.writestr("other", "")
     with pytest.raises(InputError, match="without a catalogue"):
