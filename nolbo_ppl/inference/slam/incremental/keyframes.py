@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
 
@@ -115,8 +117,20 @@ class KeyframeKeeper:
             if len(watchers) <= self.config.passes:
                 continue
             oldest = watchers[0]
-            # What hung on it hangs on the newest one of the same place: on its neighbour in time, itself forgotten later, the
-            # frames of a lap would end up far from what holds them (error of all poses 0.41 -> 1.16 m in 6 laps of 942 m).
-            graph.drop(oldest, newest)
+            graph.drop(oldest, self._support(oldest, newest, graph))
             self.condensed.remove(oldest)
             own.discard(oldest)
+
+    def _support(self, leaving: int, newest: int, graph: IncrementalGraph) -> int:
+        """What a keyframe that goes hangs on: the nearest of the first pass that shares a landmark with it.
+
+        That one stays, so that no error adds up. On the newest one of the place instead, forgotten itself later, frames slip
+        along the road and hang on what is ever farther off: error of all poses 0.24 -> 1.5 m in 12 laps of 350 m with
+        `passes=3`. On its neighbour in time: 0.41 -> 1.16 m in 6 laps of 942 m.
+        """
+        seen = {i for j in graph.landmarks_of([leaving]) for i in graph.watchers(j)} - {leaving}
+        own = set(self.condensed)
+        first = [i for i in seen if i not in own and i < newest - self.config.stretch]
+        near = sorted(first or (seen & own)) or [newest]
+        place = graph.pose(leaving)[:3, 3]
+        return min(near, key=lambda i: float(np.linalg.norm(graph.pose(i)[:3, 3] - place)))
