@@ -46,7 +46,7 @@ class Encoder(Protocol):
     channels: int
 
     def __call__(self, image: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b c gh gw"], tuple[Tensor, ...]]:
-        """Features of every cell, and finer maps for the second look (none for darknet19)."""
+        """Features of every cell, and finer maps for the RoI refinement (none for darknet19)."""
         ...
 
 

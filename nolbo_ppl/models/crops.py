@@ -1,4 +1,4 @@
-"""A second look at objects cut out of the image at one size, and sent through the encoder once more.
+"""RoI refinement of objects cut out of the image at one size, and sent through the encoder once more.
 
 An encoder learns an object's viewpoint and shape at the sizes it has seen, and knows little at others: the share of cars of
 photographs whose azimuth the scene network knows within 30 degrees is .82 where they are 90 px large, .46 at 360 px. Cut

@@ -148,7 +148,7 @@ class Fused:
     objectness_logit: Float[Tensor, "b k"]
     label_logits: Float[Tensor, "b k labels"]
     look_weight: Float[Tensor, "b k"]
-    """Weight of the label logits of the second look."""
+    """Weight of the label logits of the RoI refinement."""
     box_loc: Float[Tensor, "b k 4"]
     """Mean of the box latent."""
     box_raw: Float[Tensor, "b k 4"]

@@ -118,7 +118,7 @@ class Guide(nn.Module):
             encoding: the encoded images.
             row: the image of each region.
             region: its number, cell * predictors + predictor.
-            look: take the second look at each region's box. Boxes are the same without it, and soon found.
+            look: refine the parameters by each region's box (`roi_refinement`). Boxes are the same without it, and soon found.
             box: boxes to look at instead of the regions' own, px.
         """
         cell, predictor = region // self.config.predictors, region % self.config.predictors
@@ -199,7 +199,7 @@ class Guide(nn.Module):
     def _posterior(
         self, raw: Float[Tensor, "b m outputs"], encoding: Encoding, cell: Int[Tensor, "b m"], assigned: Tensor
     ) -> RegionParameters:
-        """Posterior parameters of every slot; the second look is taken at assigned objects only."""
+        """Posterior parameters of every slot; assigned objects alone are refined by their boxes."""
         row, slot = assigned.nonzero(as_tuple=True)
         with self._autocast():
             refined = self.head.refine(raw[row, slot], encoding.fine, row, cell[row, slot], encoding.columns)

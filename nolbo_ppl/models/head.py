@@ -20,7 +20,7 @@ from nolbo_ppl.models.shape_networks import bounded_exp
 class RegionHead(nn.Module):
     """Features -> objectness of every region, and the raw outputs of the regions that are asked for.
 
-    The small encoder has a hidden part (two layers with layer norm) and a second look at the object's box, run only where
+    The small encoder has a hidden part (two layers with layer norm) and a RoI refinement by the object's box, run only where
     they are wanted: a scene has far more cells than objects. darknet19 has the paper's linear 1 x 1 head without bias.
     """
 
@@ -69,7 +69,7 @@ class RegionHead(nn.Module):
         columns: int,
         box: Float[Tensor, "n 4"] | None = None,
     ) -> Float[Tensor, "n outputs"]:
-        """Raw outputs after the second look at each region's own box, or at a given one; the box itself stays as it is.
+        """Raw outputs refined by each region's own box, or by a given one; the box itself stays as it is.
 
         Args:
             raw: outputs of the regions from their cells.

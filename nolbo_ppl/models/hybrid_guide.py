@@ -1,8 +1,8 @@
-"""The guide of photographs: evidence of a detector and of the scene network, and a second look at each object cut out.
+"""The guide of photographs: evidence of a detector and of the scene network, and RoI refinement of each object, cut out.
 
 One amortised posterior with the sites of every guide. The image goes once through a frozen detector and, at half its size,
 through the guide's own encoder and head; their predictions are evidence about the same regions (`evidence`). Objects are then
-cut out at one size and sent through encoder, head and second look again (`crops`): viewpoint, shape and range come from
+cut out at one size and sent through encoder, head and RoI refinement again (`crops`): viewpoint, shape and range come from
 there, category from both.
 """
 
@@ -151,7 +151,7 @@ class HybridGuide(Guide):
         look: bool = True,
         box: Float[Tensor, "n 4"] | None = None,
     ) -> Float[Tensor, "n outputs"]:
-        """Raw outputs of regions: of the second look, with category and box of the evidence."""
+        """Raw outputs of regions: of the RoI refinement, with category and box of the evidence."""
         fused, dtype = encoding.fused, encoding.objectness_logit.dtype
         assert fused is not None and encoding.box is not None
         labels = fused.label_logits[row, region]
@@ -176,7 +176,7 @@ class HybridGuide(Guide):
         box: Float[Tensor, "n 4"],
         detail: Float[Tensor, " b"] | None = None,
     ) -> tuple[Float[Tensor, "n outputs"], Float[Tensor, " n"]]:
-        """Raw outputs of the second look at boxes, px, cut out of images (`crops.cut_out_detailed`), and pixels of each crop
+        """Raw outputs of the RoI refinement by boxes, px, cut out of images (`crops.cut_out_detailed`), and pixels of each crop
         over those of its image."""
         dtype = self.head.objectness.weight.dtype
         with torch.no_grad():

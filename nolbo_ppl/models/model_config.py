@@ -44,16 +44,16 @@ class ModelConfig:
     head_width: int = 320
     """Width of the head's hidden layers (tiny encoder only; darknet19 has a linear head as the paper)."""
     glimpse: int = 7
-    """Side of the grid of features sampled over each object's box, which refines its posterior; 0 for no second look
+    """Side of the grid of features sampled over each object's box, which refines its posterior; 0 for none
     (darknet19, whose head is the paper's, has none)."""
     glimpse_width: int = 96
-    """Channels of the second look, a multiple of 4."""
+    """Channels of the RoI refinement, a multiple of 4."""
     glimpse_maps: int = 2
-    """Maps of the encoder that the second look samples, from the finest on: strides 4, 8, 16."""
+    """Maps of the encoder that the RoI refinement samples, from the finest on: strides 4, 8, 16."""
     glimpse_blocks: int = 0
-    """Residual blocks of the second look."""
+    """Residual blocks of the RoI refinement."""
     glimpse_detail: bool = False
-    """The second look samples the finest map twice as densely too."""
+    """The RoI refinement samples the finest map twice as densely too."""
     shape_look: int = 0
     """Side, px, of a crop of each object that an encoder of its own looks at for the shape latent alone, a multiple of 16
     (`nolbo_ppl.models.shape_look`; tiny encoder only); 0 for none."""
@@ -137,16 +137,16 @@ class ModelConfig:
         if self.instances and self.latent_dim % 2:
             raise input_error("a latent split in two halves", got=self.latent_dim, expected="an even latent_dim")
         if self.glimpse and self.encoder == "darknet19":
-            raise input_error("a second look of darknet19", got=f"glimpse={self.glimpse}", expected="glimpse=0")
+            raise input_error("RoI refinement of darknet19", got=f"glimpse={self.glimpse}", expected="glimpse=0")
         if self.glimpse < 0 or self.glimpse_width < 4 or self.glimpse_width % 4:
             raise input_error(
-                "second look",
+                "RoI refinement",
                 got=f"glimpse={self.glimpse}, glimpse_width={self.glimpse_width}",
                 expected="glimpse >= 0 and glimpse_width a positive multiple of 4",
             )
         if not 1 <= self.glimpse_maps <= 3 or self.glimpse_blocks < 0:
             raise input_error(
-                "second look",
+                "RoI refinement",
                 got=f"glimpse_maps={self.glimpse_maps}, glimpse_blocks={self.glimpse_blocks}",
                 expected="1 to 3 maps, blocks >= 0",
             )
@@ -154,7 +154,7 @@ class ModelConfig:
             raise input_error(
                 "a detector beside the encoder",
                 got=f"encoder {self.encoder}, glimpse {self.glimpse}",
-                expected="the tiny encoder with a second look, no instance labels",
+                expected="the tiny encoder with RoI refinement, no instance labels",
             )
         if self.shape_look < 0 or self.shape_look % 16:
             raise input_error("shape_look", got=self.shape_look, expected="a multiple of 16, or 0")

@@ -36,7 +36,7 @@ class Encoding:
     rows: int
     columns: int
     fine: tuple[Float[Tensor, "b _ _ _"], ...] = ()
-    """Finer maps of the encoder, for the second look at each object."""
+    """Finer maps of the encoder, for the RoI refinement of each object."""
     shift: Float[Tensor, " b"] | None = None
     """How unlike the images learnt from each is (`nolbo_ppl.models.image_shift`); None where the guide cannot tell."""
     generated: Float[Tensor, " b"] | None = None

@@ -1,4 +1,4 @@
-"""The second look of the guide: what an object's own box holds, sampled at a fixed size, refines its posterior.
+"""The RoI refinement head of the guide: what an object's own box holds, sampled at a fixed size, refines its posterior.
 
 A cell's features describe an object at whatever size it has in the image. Sampled on a fixed grid over the object's box,
 near and far objects look alike, and far fewer images teach category, viewpoint and shape. The image still goes through

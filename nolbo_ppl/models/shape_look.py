@@ -1,6 +1,6 @@
 """A look of its own at each object's shape: the object cut out at one size, an encoder that learns nothing but shapes.
 
-The guide's second look shares its encoder with everything that is asked of an image, most of all with finding objects. What sets
+The RoI refinement shares its encoder with everything that is asked of an image, most of all with finding objects. What sets
 an instance apart from its category is little of that. Here the object is cut out (`crops`) and sent through a second encoder,
 which adds to the mean and log scale of the shape latent that the guide has found so far; all other outputs stay as they are.
 Nothing is added before any training, so that a trained guide may be given this look, and learn it alone

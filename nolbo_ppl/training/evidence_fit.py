@@ -52,7 +52,7 @@ class EvidenceTable:
     box: Float[Tensor, "n r 4"]
     """Box latent of that object."""
     look: Float[Tensor, "n r labels"]
-    """Log probabilities of the categories by the second look there."""
+    """Log probabilities of the categories by the RoI refinement there."""
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -292,7 +292,7 @@ def _fit_domain(fusion: Fusion, context: Float[Tensor, "n c"], generated: Bool[T
 
 
 def _fit_photographs(fusion: Fusion, table: EvidenceTable, steps: int = 200) -> None:
-    """Factor and shift of the detector's log odds, and weights of its and the second look's log probabilities: four numbers."""
+    """Factor and shift of the detector's log odds, weights of its and the RoI refinement's log probabilities: four numbers."""
     labels = table.look.shape[-1]
     background = (table.known & ~table.is_object).sum(1) >= MIN_BACKGROUND
     strong = table.known & (table.detector.log_odds > WEAK) & background[:, None]

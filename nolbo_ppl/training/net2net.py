@@ -1,7 +1,7 @@
 """Networks grown into larger ones that start as what they were, so that what was learnt is kept.
 
 New residual blocks start as the identity (their last normalisation multiplies by zero; in the encoder the activation after
-the sum is applied once more, which shrinks what was negative), new inputs of the second look start at weight zero.
+the sum is applied once more, which shrinks what was negative), new inputs of the RoI refinement start at weight zero.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def grown_config(config: ModelConfig, larger: ModelConfig) -> ModelConfig:
     """A configuration with the growing fields of a larger one, everything else as it is.
 
     Raises:
-        InputError: one of those fields is smaller in `larger`, or there is no second look to grow.
+        InputError: one of those fields is smaller in `larger`, or there is no RoI refinement to grow.
     """
     if not config.glimpse:
-        raise input_error("networks to grow", got="no second look", expected="networks with one")
+        raise input_error("networks to grow", got="no RoI refinement", expected="networks with one")
     for name in GROWING:
         before, after = getattr(config, name), getattr(larger, name)
         pairs = zip(before, after, strict=True) if isinstance(before, tuple) else [(before, after)]
@@ -58,7 +58,7 @@ def grow(model: Nolbo, config: ModelConfig, seed: int) -> Nolbo:
 
 
 def _renamed(name: str, before: ModelConfig, after: ModelConfig) -> str:
-    """Name of a weight among the larger networks: new blocks of the second look stand before its last convolution."""
+    """Name of a weight among the larger networks: new blocks of the RoI refinement stand before its last convolution."""
     shift = after.glimpse_blocks - before.glimpse_blocks
     match = re.fullmatch(r"(.*glimpse\.look\.)(\d+)(\..*)", name)
     if match is None or int(match[2]) < 3 + before.glimpse_blocks:

@@ -1,7 +1,7 @@
 """The last stage of a model with a detector: how its evidence is read on photographs, fitted on labelled ones kept apart.
 
 Four numbers (`Fusion.photograph`): factor and shift of the detector's log odds, so that objectness is a probability of the
-detections that remain after suppression; factor of its log probabilities; and the share of the second look in the category,
+detections that remain after suppression; factor of its log probabilities; and the share of the RoI refinement in the category,
 which is kept only where it gains average precision. Fitted on the regions that training photographs offer instead
 (`evidence_fit`), duplicates of one object count as background and the objectness comes out too low.
 """
@@ -45,7 +45,7 @@ class FoundObjects:
     own: Float[np.ndarray, "n labels"]
     """Its log probabilities of the categories."""
     look: Float[np.ndarray, "n labels"]
-    """Those of the second look."""
+    """Those of the RoI refinement."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class PhotographFit:
     label_factor: float
     """Of its log probabilities of the categories."""
     look_share: float
-    """Weight of the second look's log probabilities."""
+    """Weight of the RoI refinement's log probabilities."""
     photographs: int
     detections: int
     map50_without_look: float

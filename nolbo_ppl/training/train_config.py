@@ -140,7 +140,7 @@ class TrainConfig:
     learn: Literal["all", "shape_look"] = "all"
     """What is learnt of the guide: everything, or its look at shapes alone, all else of the initial weights as it is."""
     grow: bool = False
-    """Grow the initial networks to the blocks and the second look of the preset (`nolbo_ppl.training.net2net`)."""
+    """Grow the initial networks to the blocks and the RoI refinement of the preset (`nolbo_ppl.training.net2net`)."""
     cache: Path = DEFAULT_CACHE
     """Where generated scenes are kept."""
     seed: int = 0

@@ -1,4 +1,4 @@
-"""The second look: the grid over a box, bilinear samples against an independent sampler, its place in the guide."""
+"""The RoI refinement: the grid over a box, bilinear samples against an independent sampler, its place in the guide."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_configurations_without_a_second_look() -> None:
     assert model.guide.head.glimpse is None
     scene = model.guide.observe(random_batch(tiny_config(), 2, 3))
     assert bool(torch.isfinite(scene.posterior.shape_loc).all())
-    with pytest.raises(InputError, match="second look of darknet19"):
+    with pytest.raises(InputError, match="RoI refinement of darknet19"):
         ModelConfig(encoder="darknet19", image_size=448)
     with pytest.raises(InputError, match="multiple of 4"):
         tiny_config(glimpse_width=6)

@@ -76,5 +76,5 @@ def test_every_new_weight_learns() -> None:
 def test_refusals() -> None:
     with pytest.raises(InputError, match="encoder_blocks of networks to grow"):
         grown_config(tiny_config(encoder_blocks=(1, 1, 3)), tiny_config(encoder_blocks=(1, 1, 2)))
-    with pytest.raises(InputError, match="no second look"):
+    with pytest.raises(InputError, match="no RoI refinement"):
         grown_config(tiny_config(glimpse=0), nano())

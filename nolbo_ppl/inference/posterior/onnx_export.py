@@ -1,6 +1,6 @@
 """Guide and decoder as ONNX files, for programs without torch: a graph from pixels to the posterior, one from latents to voxels.
 
-The guide's graph answers for the `candidates` likeliest regions of one image, the second look included, with calibrated scales
+The guide's graph answers for the `candidates` likeliest regions of one image, the RoI refinement included, with calibrated scales
 and in the units of `ObjectPosteriors`; which of them describe one object (suppression) is left to who runs it
 (docs/howto/without-torch.md).
 """

@@ -154,7 +154,7 @@ class ObservationModel:
         """Posterior of the region responsible for each given box (px of the given image), in the order of the boxes.
 
         The responsible predictor is the one of the box's cell whose own box overlaps it most (NOLBO, implementation). The
-        guide takes its second look at the given box.
+        guide refines its answer by the given box.
 
         Raises:
             InputError: boxes that are not finite, not corners in order, outside of their image or less than a pixel wide;
@@ -271,7 +271,7 @@ class ObservationModel:
         return self.calibration.apply(q.at_map_category(self._prior_mean))
 
     def _boxes(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> Float[Tensor, "n 4"]:
-        """Boxes of regions, px of the scaled image; no second look is needed for them."""
+        """Boxes of regions, px of the scaled image; no RoI refinement is needed for them."""
         at = self.device
         q = self._networks.guide.parameters_at(encoding, row.to(at), region.to(at), look=False)
         return decode_box(q.box_loc.cpu(), region // self.config.predictors, encoding.columns, self.config)

@@ -34,7 +34,7 @@ from tests.factories import (
 def test_gradients_against_finite_differences(form: str, objective: str) -> None:
     """Along random directions, one for each part of the networks, with missing labels and fixed noise.
 
-    Without the second look: where it looks moves with the box, and no gradient is passed through that on purpose.
+    Without the RoI refinement: where it looks moves with the box, and no gradient is passed through that on purpose.
     """
     config = instance_config(orientation=form, glimpse=0)
     model = tiny_model(config, scatter=0.05)
