@@ -28,6 +28,7 @@ MASSES = {
     "position": "position_mass",
     "position_tails": "position_tails_mass",
     "latent": "latent_mass",
+    "latent_gaussian": "latent_gaussian_mass",
 }
 """Regions whose coverage is reported, and where their masses stand in the records."""
 LOG_DENSITIES = {
@@ -35,6 +36,7 @@ LOG_DENSITIES = {
     "position": "position_log_density",
     "position_tails": "position_tails_log_density",
     "latent": "latent_log_density",
+    "latent_gaussian": "latent_gaussian_log_density",
 }
 """Densities whose log scores are reported."""
 NULL_DRAWS = 200

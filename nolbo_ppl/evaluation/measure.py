@@ -6,6 +6,7 @@ region responsible for each ("with ground truth bounding box", NOLBO Table 1).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
@@ -24,8 +25,11 @@ from nolbo_ppl.metrics.viewpoint_error import rotation_error
 from nolbo_ppl.metrics.voxel import voxel_average_precision, voxel_iou
 from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.structures.annotations import Annotations
+from nolbo_ppl.structures.latent_modes import LatentModes
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
+LATENT_DRAWS = 2000
+"""Draws that measure regions of mixtures: their masses are right to 0.011."""
 CRPS_NODES = 360
 """Nodes on the circle of the ranked probability score: one a degree."""
 
@@ -80,7 +84,7 @@ def measure_objects(
     viewpoint = _allocentric(R_truth, _rays(truth, slots))
     orientation = _orientation(viewpoint, symmetry, answers)
     voxels = np.concatenate([_voxels(scene)[rows] for scene, rows in zip(truth, slots)])
-    shape = _shape(voxels, category, said("latent"), said("latent_scale"), model)
+    shape = _shape(voxels, category, said("latent"), said("latent_scale"), _latent_modes(answers), model)
     log_posterior = said("class_log_posterior")
     oriented = np.isfinite(R_truth).all((1, 2))
     error = np.full(len(category), np.nan)
@@ -184,15 +188,46 @@ def _orientation(
     return result
 
 
+def _latent_modes(answers: Sequence[ObjectPosteriors]) -> LatentModes:
+    """The latents of all answers as mixtures, those of models without categories of one mode."""
+    parts = [one.latent_modes or LatentModes.of_one(one.latent) for one in answers]
+    return LatentModes(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in dataclasses.fields(LatentModes))
+    )
+
+
+def _latent_regions(
+    teacher: Float[np.ndarray, "n d"],
+    latent: Float[np.ndarray, "n d"],
+    scale: Float[np.ndarray, "n d"],
+    modes: LatentModes,
+) -> dict[str, Float[np.ndarray, " n"]]:
+    """Mass and log density of the latents' mixtures at the truth, and of the likeliest category's Gaussian beside them."""
+    one = chi_square_mass(teacher - latent, scale**2)
+    mass, several = one.copy(), np.flatnonzero((modes.weight > 0).sum(axis=1) > 1)
+    if len(several):
+        # One set of draws for all: an object's figure does not depend on which others are measured with it.
+        draws = np.random.default_rng(0).standard_normal((LATENT_DRAWS, latent.shape[1]))
+        mass[several] = modes.select(several).region_mass(teacher[several], scale[several], draws)
+    return {
+        "latent_mass": mass,
+        "latent_log_density": modes.log_density(teacher, scale),
+        "latent_gaussian_mass": one,
+        "latent_gaussian_log_density": LatentModes.of_one(latent).log_density(teacher, scale),
+    }
+
+
 def _shape(
     packed: UInt8[np.ndarray, "n bytes"],
     category: Int[np.ndarray, " n"],
     latent: Float[np.ndarray, "n d"],
     latent_scale: Float[np.ndarray, "n d"],
+    modes: LatentModes,
     model: ShapeModel,
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Voxel figures and the mass of the latent's region, NaN where the true shape is unknown."""
-    names = ("latent_mass", "latent_log_density", "voxel_iou", "category_iou", "teacher_iou", "voxel_ap")
+    """Voxel figures and those of the latent's regions, NaN where the true shape is unknown."""
+    regions = [f"latent{law}_{figure}" for law in ("", "_gaussian") for figure in ("mass", "log_density")]
+    names = (*regions, "voxel_iou", "category_iou", "teacher_iou", "voxel_ap")
     result = {name: np.full(len(category), np.nan) for name in names}
     rows = np.flatnonzero(packed.any(1))
     if not len(rows):
@@ -201,10 +236,8 @@ def _shape(
     side = round((8 * packed.shape[1]) ** (1 / 3))
     truth = unpack_voxels(packed[rows], side)
     teacher, _ = model.shape_posterior(pack_voxels(_refined(truth, prior.shape[1])))
-    result["latent_mass"][rows] = chi_square_mass(teacher - latent[rows], latent_scale[rows] ** 2)
-    spread = latent_scale[rows]
-    density = -0.5 * ((teacher - latent[rows]) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
-    result["latent_log_density"][rows] = density.sum(axis=1)
+    for name, value in _latent_regions(teacher, latent[rows], latent_scale[rows], modes.select(rows)).items():
+        result[name][rows] = value
     decoded = _coarsened(model.decode(latent[rows]), side)
     result["voxel_iou"][rows] = voxel_iou(decoded, truth)
     result["voxel_ap"][rows] = voxel_average_precision(decoded, truth)

@@ -61,9 +61,14 @@ class ObjectRecords:
     sized_depth_error: Float[np.ndarray, " n"]
     """The same, of the depth that follows when the object's true size is told."""
     latent_mass: Float[np.ndarray, " n"]
-    """Mass of the region of the shape latent that reaches to the mean the shape autoencoder gives the true shape."""
+    """Mass of the region of the shape latent, a mixture over categories, that reaches to the mean the shape autoencoder gives the
+    true shape."""
     latent_log_density: Float[np.ndarray, " n"]
-    """Log density of the latent's Gaussian at that mean, nats."""
+    """Log density of that mixture at that mean, nats."""
+    latent_gaussian_mass: Float[np.ndarray, " n"]
+    """As `latent_mass`, of the likeliest category's Gaussian alone."""
+    latent_gaussian_log_density: Float[np.ndarray, " n"]
+    """Its log density, nats."""
     voxel_iou: Float[np.ndarray, " n"]
     """IoU of the decoded posterior mean."""
     category_iou: Float[np.ndarray, " n"]

@@ -4,10 +4,11 @@ One detection a line: `frame` (row of the odometry, from 0) and `position` [x, y
 `position_std` (a number or 3) or `position_cov` (3x3), `position_tails` [degrees of freedom, factor on the covariance] of
 Student's t about the position, `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
 `rotation_modes` (a list of `weight`, `rotation`, `std`: all modes of the orientation), `latent` [d], `latent_std` (a number
-or d), `objectness` (default 1), `category`, `size` [3] m, `symmetry` (1 none, n n-fold, 0 free about the object's vertical
-axis), `id`. A model's own lines say more, which SLAM does not use and every reader keeps: `image`, `time` s, `box`
-[x0, y0, x1, y1] px, `class_posterior` (probability by category), `viewpoint` [azimuth, elevation, in-plane] rad,
-`azimuth_modes` (a list of `weight`, `azimuth`, `concentration`).
+or d), `latent_modes` (a list of `weight`, `latent`: all modes of the latent, each with `latent_std`), `objectness` (default 1),
+`category`, `size` [3] m, `symmetry` (1 none, n n-fold, 0 free about the object's vertical axis), `id`. A model's own lines say
+more, which SLAM does not use and every reader keeps: `image`, `time` s, `box` [x0, y0, x1, y1] px, `class_posterior`
+(probability by category), `viewpoint` [azimuth, elevation, in-plane] rad, `azimuth_modes` (a list of `weight`, `azimuth`,
+`concentration`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from nolbo_ppl.io.fields import is_number, is_whole, number_array
 from nolbo_ppl.io.files import read_jsonl, write_jsonl
 from nolbo_ppl.structures.detection_checks import MAX_POSITION, check_table
 from nolbo_ppl.structures.detection_records import to_records
-from nolbo_ppl.structures.detections import ARRAYS, Detections, heaviest_mode, merged_order, padding
+from nolbo_ppl.structures.detections import ARRAYS, Detections, heaviest_latent, heaviest_mode, merged_order, padding
 
 FIELDS = (
     "frame",
@@ -47,6 +48,7 @@ FIELDS = (
     "azimuth_modes",
     "latent",
     "latent_std",
+    "latent_modes",
     "size",
     "symmetry",
 )
@@ -101,24 +103,41 @@ def _modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
             expected='[{"weight": w, "rotation": [qx, qy, qz, qw], "std": rad}, ...]',
             **where,
         )
-    weight = []
-    for i, mode in enumerate(value):
-        if set(mode) != {"weight", "rotation", "std"}:
-            raise input_error(
-                f"`rotation_modes` {i} has wrong fields", got=sorted(mode), expected="weight, rotation, std", **where
-            )
-        w = mode["weight"]
-        if not is_number(w, 0, 1 + WEIGHT_ROUNDING):
-            raise input_error(f"`rotation_modes` {i}: `weight` is no weight", got=w, expected="0 or more", **where)
-        weight.append(float(w))
-    total = sum(weight)
-    if not abs(total - 1) < 1e-2:
-        raise input_error("weights of `rotation_modes` do not sum to one", got=total, expected="1", **where)
+    weight = _mode_weights("rotation_modes", value, ("weight", "rotation", "std"), where)
     return {
-        "mode_weight": np.array(weight) / (1.0 if abs(total - 1) <= WEIGHT_ROUNDING else total),
+        "mode_weight": weight,
         "mode_rotation": np.stack([_rotation(mode, where, "rotation_modes") for mode in value]),
         "mode_std": np.concatenate([_scale(mode, "std", 1, where) for mode in value]),
     }
+
+
+def _latent_modes(value: Any, where: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The modes of a latent; weights sum to one."""
+    if not isinstance(value, list) or not value or not all(isinstance(mode, dict) for mode in value):
+        expected = '[{"weight": w, "latent": [z, ...]}, ...]'
+        raise input_error("`latent_modes` is no list of modes", got=value, expected=expected, **where)
+    weight = _mode_weights("latent_modes", value, ("weight", "latent"), where)
+    latents = [_vector(mode, "latent", None, where) for mode in value]
+    lengths = sorted({len(latent) for latent in latents})
+    if len(lengths) > 1:
+        raise input_error("`latent_modes` of different lengths", got=lengths, expected="one length", **where)
+    return {"latent_mode_weight": weight, "latent_mode": np.stack(latents)}
+
+
+def _mode_weights(name: str, modes: list[dict[str, Any]], keys: tuple[str, ...], where: dict[str, Any]) -> np.ndarray:
+    """Weights of a list of modes, which sum to one; every mode has the given fields."""
+    weight = []
+    for i, mode in enumerate(modes):
+        if set(mode) != set(keys):
+            raise input_error(f"`{name}` {i} has wrong fields", got=sorted(mode), expected=", ".join(keys), **where)
+        w = mode["weight"]
+        if not is_number(w, 0, 1 + WEIGHT_ROUNDING):
+            raise input_error(f"`{name}` {i}: `weight` is no weight", got=w, expected="0 or more", **where)
+        weight.append(float(w))
+    total = sum(weight)
+    if not abs(total - 1) < 1e-2:
+        raise input_error(f"weights of `{name}` do not sum to one", got=total, expected="1", **where)
+    return np.array(weight) / (1.0 if abs(total - 1) <= WEIGHT_ROUNDING else total)
 
 
 def _number(value: Any, low: float, high: float, what: str, where: dict[str, Any]) -> float:
@@ -217,8 +236,15 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
             out.setdefault("rotation_scale", float(scale[0]))
     if row.get("latent") is not None:
         out["latent"] = _vector(row, "latent", None, where)
-        if row.get("latent_std") is not None:
-            out["latent_scale"] = _scale(row, "latent_std", len(out["latent"]), where)
+    if row.get("latent_modes") is not None:
+        out.update(_latent_modes(row["latent_modes"], where))
+        mode = out["latent_mode"]
+        best = heaviest_latent(out["latent_mode_weight"][None], mode[None])[0]
+        if len(out.setdefault("latent", best)) != mode.shape[1]:
+            got, expected = mode.shape[1], f"{len(out['latent'])}, as `latent` has"
+            raise input_error("`latent_modes` have another length", got=got, expected=expected, **where)
+    if "latent" in out and row.get("latent_std") is not None:
+        out["latent_scale"] = _scale(row, "latent_std", len(out["latent"]), where)
     objectness = row.get("objectness", 1.0)
     if not is_number(objectness, 0, 1):
         raise input_error("`objectness` is no probability", got=objectness, expected="0 to 1", **where)
@@ -288,6 +314,7 @@ def _table(rows: list[dict[str, Any]]) -> Detections:
         return max((len(row[name]) for row in rows if name in row), default=0)
 
     latent, modes, azimuths = longest("latent"), longest("mode_weight"), longest("azimuth")
+    latents = longest("latent_mode_weight")
     names = merged_order(tuple(row["class_posterior"]) for row in rows if "class_posterior" in row)
     for row in rows:
         if "class_posterior" in row:
@@ -309,6 +336,8 @@ def _table(rows: list[dict[str, Any]]) -> Detections:
         "azimuth": (azimuths,),
         "azimuth_concentration": (azimuths,),
         "position_tails": (2,),
+        "latent_mode_weight": (latents,),
+        "latent_mode": (latents, latent),
     }
 
     def column(name: str) -> np.ndarray:

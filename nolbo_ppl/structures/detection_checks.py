@@ -68,5 +68,13 @@ def check_table(table: Detections, frames: int) -> None:
     refuse(~(residual < 1e-3) | mirrored, "mode_rotation is no rotation", turned, "orthonormal")
     bad = (~(table.mode_std > 0) | np.isinf(table.mode_std)).any(axis=1)
     refuse(bad, "mode_std is not a positive number", table.mode_std, "greater than 0")
+    weight = table.latent_mode_weight
+    shape = (*weight.shape, table.latent_dim)
+    if weight.shape[1] and table.latent_mode.shape != shape:
+        raise input_error("latent_mode has the wrong shape", got=table.latent_mode.shape, expected=shape)
+    refuse(~(np.isfinite(weight) & (weight >= 0)).all(axis=1), "latent_mode_weight is no weight", weight, "0 or more")
+    stated = weight.sum(axis=1) > 0
+    refuse(stated & ~table.has_latent, "modes without a latent", weight, "`latent`, the heaviest mode, as well")
+    refuse(~np.isfinite(table.latent_mode).all(axis=(1, 2)), "latent_mode is not finite", table.latent_mode, "finite numbers")
     refuse(np.isinf(table.latent).any(axis=1), "latent is not finite", table.latent, "finite numbers")
     refuse(~((table.objectness >= 0) & (table.objectness <= 1)), "objectness is no probability", table.objectness, "0 to 1")

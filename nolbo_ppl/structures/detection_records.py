@@ -90,6 +90,11 @@ def _record(d: Detections, i: int, quaternion: np.ndarray, mode_quaternion: np.n
         row["latent"] = d.latent[i].tolist()
         if np.isfinite(d.latent_scale[i]).all():
             row["latent_std"] = d.latent_scale[i].tolist()
+        used = np.flatnonzero(d.latent_mode_weight[i] > 0)
+        if len(used):
+            row["latent_modes"] = [
+                {"weight": float(d.latent_mode_weight[i, k]), "latent": d.latent_mode[i, k].tolist()} for k in used
+            ]
     if np.isfinite(d.size[i]).all():
         row["size"] = d.size[i].tolist()
     if d.symmetry[i] >= 0:

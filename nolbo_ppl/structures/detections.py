@@ -83,6 +83,10 @@ class Detections:
     position_tails: Float[np.ndarray, "n 2"] = NOT_STATED
     """Law of the true position about the stated one: degrees of freedom of Student's t, and the factor on the covariance that
     makes it the scale matrix; NaN: nobody states one."""
+    latent_mode_weight: Float[np.ndarray, "n L"] = NOT_STATED
+    """Weights of the modes of the latent, 0 where there are fewer or none is stated; L is 0 when nobody states any."""
+    latent_mode: Float[np.ndarray, "n L d"] = NOT_STATED
+    """Their means, all with `latent_scale`; `latent` is the heaviest. 0 where there are fewer."""
 
     def __post_init__(self) -> None:
         n = len(self.frame)
@@ -90,7 +94,8 @@ class Detections:
             object.__setattr__(self, "image", (None,) * n)
         for name, columns in OPTIONAL.items():
             if getattr(self, name) is NOT_STATED:
-                object.__setattr__(self, name, padding(name, (n, *columns)))
+                shape = (n, 0, self.latent_dim) if name == "latent_mode" else (n, *columns)
+                object.__setattr__(self, name, padding(name, shape))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -161,6 +166,8 @@ class Detections:
         image: Iterable[str | None] | None = None,
         time: Any = None,
         box: Any = None,
+        latent_mode_weight: Any = None,
+        latent_mode: Any = None,
     ) -> Detections:
         """Build a table from arrays; everything but frame and position is optional, scalars are broadcast.
 
@@ -172,6 +179,8 @@ class Detections:
             latent: [n, d]; `latent_scale` [n, d], [n] or a number.
             mode_weight: [n, K] weights of the orientation's modes (0: no such mode), with `mode_rotation` [n, K, 3, 3] and
                 `mode_std` [n, K] or a number in rad; where `rotation` is not given it is the heaviest mode.
+            latent_mode_weight: [n, L] weights of the latent's modes (0: no such mode), with `latent_mode` [n, L, d]; where
+                `latent` is not given it is the heaviest mode.
             image: [n] names of images, with `time` [n] s and `box` [n, 4] px.
 
         Raises:
@@ -194,7 +203,11 @@ class Detections:
             except ValueError:
                 raise input_error(f"{name} has the wrong shape", got=array.shape, expected=shape) from None
 
-        dimension = 0 if latent is None else np.asarray(latent).shape[-1]
+        latents = 0 if latent_mode_weight is None else np.asarray(latent_mode_weight).shape[-1]
+        if latents and latent_mode is None:
+            raise input_error("modes of the latent are incomplete", expected="latent_mode_weight and latent_mode")
+        known = latent_mode if latents and latent is None else latent
+        dimension = 0 if known is None else np.asarray(known).shape[-1]
         if position_covariance is None and position_scale is not None:
             scale = full(position_scale, (n, 3), "position_scale")
             position_covariance = scale[:, :, None] ** 2 * np.eye(3)
@@ -207,6 +220,12 @@ class Detections:
             }
             if rotation is None:
                 rotation, rotation_scale = heaviest_mode(**modes)
+        if latents:
+            weight = full(latent_mode_weight, (n, latents), "latent_mode_weight")
+            mean = full(latent_mode, (n, latents, dimension), "latent_mode")
+            modes |= {"latent_mode_weight": weight, "latent_mode": mean}
+            if latent is None:
+                latent = heaviest_latent(weight, mean)
         texts: dict[str, Any] = {
             "category": tuple(category) if category is not None else (None,) * n,
             "id": tuple(id) if id is not None else tuple(str(i) for i in range(n)),
@@ -255,7 +274,7 @@ class Detections:
         joined: dict[str, Any] = {"class_names": names}
         for name in ARRAYS:
             values = [getattr(table, name) for table in tables]
-            width = max((value.shape[1:2] for value in values), default=())
+            width = tuple(max(lengths) for lengths in zip(*(value.shape[1:] for value in values)))
             joined[name] = np.concatenate([_widened(name, value, width) for value in values])
         for name in TEXTS:
             joined[name] = tuple(text for table in tables for text in getattr(table, name))
@@ -278,23 +297,30 @@ OPTIONAL: dict[str, tuple[int, ...]] = {
     "azimuth": (0,),
     "azimuth_concentration": (0,),
     "position_tails": (2,),
+    "latent_mode_weight": (0,),
+    "latent_mode": (0, 0),
 }
 """Numbers that a table may be made without, and the shape of a row that nobody stated."""
+
+
+NOTHING = ("mode_weight", "latent_mode_weight", "latent_mode")
+"""Numbers that are 0 where nobody states them."""
 
 
 def padding(name: str, shape: tuple[int, ...]) -> np.ndarray:
     """What stands for a missing value of a field."""
     if name == "mode_rotation":
         return np.tile(np.eye(3), (*shape[:2], 1, 1))
-    return np.full(shape, {"mode_weight": 0.0, "mode_std": 1.0}.get(name, np.nan))
+    return np.full(shape, {"mode_std": 1.0}.get(name, 0.0 if name in NOTHING else np.nan))
 
 
 def _widened(name: str, value: np.ndarray, width: tuple[int, ...]) -> np.ndarray:
-    """A field with as many columns as `width` says, the new ones missing."""
-    if not width or value.shape[1] == width[0]:
-        return value
-    more = padding(name, (len(value), width[0] - value.shape[1], *value.shape[2:]))
-    return np.concatenate([value, more], axis=1)
+    """A field with rows of the shape that `width` says, what is new missing."""
+    for axis, length in enumerate(width, start=1):
+        if value.shape[axis] < length:
+            more = padding(name, (*value.shape[:axis], length - value.shape[axis], *value.shape[axis + 1 :]))
+            value = np.concatenate([value, more], axis=axis)
+    return value
 
 
 def _in_columns(table: Detections, names: tuple[str, ...]) -> Detections:
@@ -327,6 +353,12 @@ def heaviest_mode(
     row, best = np.arange(len(mode_weight)), np.argmax(mode_weight, axis=1)
     none = mode_weight[row, best] <= 0
     return (np.where(none[:, None, None], np.nan, mode_rotation[row, best]), np.where(none, np.nan, mode_std[row, best]))
+
+
+def heaviest_latent(weight: Float[np.ndarray, "n L"], mode: Float[np.ndarray, "n L d"]) -> Float[np.ndarray, "n d"]:
+    """Latent of each row's heaviest mode, NaN where a row has none."""
+    row, best = np.arange(len(weight)), np.argmax(weight, axis=1)
+    return np.where(weight[row, best][:, None] > 0, mode[row, best], np.nan)
 
 
 if not TYPE_CHECKING:  # type checkers know the new names alone

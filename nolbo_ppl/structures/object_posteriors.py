@@ -16,6 +16,7 @@ from nolbo_ppl.geometry.pose import quaternion_to_matrix
 from nolbo_ppl.geometry.voxels import voxels_to_mesh
 from nolbo_ppl.structures.detection_records import rounded_quaternion, significant, to_records
 from nolbo_ppl.structures.detections import Detections
+from nolbo_ppl.structures.latent_modes import LatentModes
 
 MIN_CONCENTRATION = 0.1
 """Concentrations below this leave the azimuth open; the scale of a mode grows no further."""
@@ -118,6 +119,8 @@ class ObjectPosteriors:
     shift: float | None = None
     """How unlike the images that were learnt from this image is: 0 like the middle one, 1 as 3 in 100; beyond, objects are less
     probable and every scale is wider. None for models that cannot tell."""
+    latent_modes: LatentModes | None = None
+    """The latent as a mixture over likely categories, all with `latent_scale`; the first is `latent`. None: that one alone."""
 
     def __len__(self) -> int:
         return len(self.objectness)
@@ -129,8 +132,8 @@ class ObjectPosteriors:
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 value = value[index]
-            elif isinstance(value, ViewpointModes):
-                value = ViewpointModes(*(getattr(value, f.name)[index] for f in dataclasses.fields(value)))
+            elif isinstance(value, (ViewpointModes, LatentModes)):
+                value = type(value)(*(getattr(value, f.name)[index] for f in dataclasses.fields(value)))
             fields[field.name] = value
         return ObjectPosteriors(**fields)
 
@@ -146,6 +149,11 @@ class ObjectPosteriors:
         """q(l | I)."""
         probability: np.ndarray = np.exp(self.class_log_posterior)
         return probability
+
+    def latent_log_density(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        """Log density of each object's latent posterior at a latent, nats: the mixture over categories."""
+        modes = self.latent_modes or LatentModes.of_one(self.latent)
+        return modes.log_density(z, self.latent_scale)
 
     def mesh(self, index: int, metric: bool = True) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
         """Mesh of an object's mean shape by marching cubes, in its own frame; in metres, or in units of the diagonal.
@@ -227,7 +235,20 @@ class ObjectPosteriors:
             azimuth=significant(self.viewpoint_modes.azimuth),
             azimuth_concentration=significant(self.viewpoint_modes.concentration),
             position_tails=self._tails,
+            **self._several_latent_modes(),
         )
+
+    def _several_latent_modes(self) -> dict[str, Float[np.ndarray, "n K *d"]]:
+        """The latent's modes as detections hold them: nothing of an object that has one, which `latent` says."""
+        modes = self.latent_modes
+        if modes is None or not (modes.weight[:, 1:] > 0).any():
+            return {}
+        several = (modes.weight > 0).sum(axis=1) > 1
+        weight = np.where(several[:, None], significant(modes.weight), 0.0)
+        kept = weight > 0
+        count = int(kept.sum(axis=1).max())  # heaviest first
+        mean = np.where(kept[..., None], significant(modes.mean), 0.0)
+        return {"latent_mode_weight": weight[:, :count], "latent_mode": mean[:, :count]}
 
     def _undescribed(self, frame: int, image: str | None, time: float | None) -> Detections:
         """Detections without category and orientation: box, position, size and latent."""

@@ -48,6 +48,7 @@ WORDS = {
     "position_log_score": "log score of the position's Gaussian, nats per m³",
     "position_tails_log_score": "the same, of the law with tails",
     "latent_log_score": "log score of the shape latent, nats",
+    "latent_gaussian_log_score": "the same, of the likeliest category's Gaussian",
     "ece_objectness_if_perfect": "calibration error a perfect forecaster would show: objectness",
     "ece_class_if_perfect": "the same: category",
     "ece_objectness_debiased": "calibration error of objectness less what noise makes (root mean square)",
@@ -60,6 +61,7 @@ WORDS = {
             ("position", "position"),
             ("position_tails", "position, law with tails"),
             ("latent", "shape latent"),
+            ("latent_gaussian", "shape latent, the likeliest category's Gaussian"),
         )
         for level in (50, 68, 90, 95, 99)
     },

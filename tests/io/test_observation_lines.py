@@ -115,6 +115,16 @@ def test_an_empty_file_is_an_empty_table(tmp_path: Path) -> None:
         ({**LINE, "rotation_modes": [{**MODE, "weight": 0.5}]}, "do not sum to one"),
         ({**LINE, "rotation_modes": [{**MODE, "rotation": [0, 0, 0, 2]}]}, "`rotation_modes` is no unit quaternion"),
         ({**LINE, "rotation_modes": [{**MODE, "std": 0}]}, "no standard deviation"),
+        ({**LINE, "latent_modes": [[1, 2]]}, "`latent_modes` is no list of modes"),
+        ({**LINE, "latent_modes": [{"weight": 1.0}]}, "`latent_modes` 0 has wrong fields"),
+        ({**LINE, "latent_modes": [{"weight": 2.0, "latent": [0.0]}]}, "`latent_modes` 0: `weight` is no weight"),
+        ({**LINE, "latent_modes": [{"weight": 0.4, "latent": [0.0]}]}, "weights of `latent_modes` do not sum to one"),
+        ({**LINE, "latent_modes": [{"weight": 1.0, "latent": ["x"]}]}, "`latent` is no vector"),
+        ({**LINE, "latent": [0.0, 1.0], "latent_modes": [{"weight": 1.0, "latent": [0.0]}]}, "another length.*2, as `latent`"),
+        (
+            {**LINE, "latent_modes": [{"weight": 0.5, "latent": [0.0]}, {"weight": 0.5, "latent": [0.0, 1.0]}]},
+            "`latent_modes` of different lengths",
+        ),
     ],
 )
 def test_damage_is_named_with_its_line(tmp_path: Path, change: object, match: str) -> None:

@@ -12,8 +12,10 @@ import pytest
 
 from nolbo_ppl.geometry.pose import quaternion_to_matrix, rotation_angle, so3_exp
 from nolbo_ppl.io.observations import read_observations, write_observations
+from nolbo_ppl.metrics.calibration import chi_square_mass
 from nolbo_ppl.structures.detection_checks import check_table
 from nolbo_ppl.structures.detections import Detections
+from nolbo_ppl.structures.latent_modes import LatentModes, modes_by_category
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 UPRIGHT_AND_FACING_BACK = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -132,3 +134,75 @@ def test_rows_carry_the_whole_posterior() -> None:
         for k, mode in enumerate(row["rotation_modes"]):
             np.testing.assert_allclose(quaternion_to_matrix(np.array(mode["rotation"])), modes.R_camera_object[i, k], atol=1e-7)
             assert mode["std"] == pytest.approx(modes.scale[i, k], abs=1e-5)
+
+
+PRIOR_MEAN = np.array([[0.0, 0.0], [3.0, -4.0]])
+
+
+def mixed(**change: Any) -> ObjectPosteriors:
+    """The first object is car or bottle, of the second nothing but bottle is likely."""
+    posterior = np.log([[0.2, 0.8], [0.99, 0.01]])
+    latent = np.arange(4.0).reshape(2, 2)
+    return observations(
+        class_log_posterior=posterior, latent=latent, latent_modes=modes_by_category(latent, posterior, PRIOR_MEAN), **change
+    )
+
+
+def test_latent_is_a_mixture_over_categories() -> None:
+    """sum_l q(l | I) N(z; prior mean + residual, scale), summed by hand, the residual that of the likeliest category."""
+    seen = mixed()
+    assert seen.latent_modes is not None
+    np.testing.assert_array_equal(seen.latent_modes.category[0], [1, 0])
+    np.testing.assert_array_equal(seen.latent_modes.mean[:, 0], seen.latent)
+    np.testing.assert_allclose(seen.latent_modes.mean[0, 1], seen.latent[0] - PRIOR_MEAN[1])
+    np.testing.assert_allclose(seen.latent_modes.weight, [[0.8, 0.2], [1.0, 0.0]])  # 0.01 is left out
+    z = np.array([[-2.5, 4.8], [2.1, 3.3]])
+    residual = seen.latent - PRIOR_MEAN[[1, 0]]
+    for i, weights in enumerate(([0.2, 0.8], [1.0, 0.0])):
+        error = (z[i] - PRIOR_MEAN - residual[i]) / seen.latent_scale[i]
+        density = np.exp(-0.5 * error**2).prod(axis=1) / (2 * np.pi * seen.latent_scale[i].prod())
+        np.testing.assert_allclose(seen.latent_log_density(z)[i], np.log(weights @ density), rtol=1e-12)
+    plain = observations(latent=seen.latent)  # nobody states modes
+    np.testing.assert_allclose(plain.latent_log_density(z)[1], seen.latent_log_density(z)[1], rtol=1e-12)
+    np.testing.assert_array_equal(seen[[1]].latent_modes.weight, seen.latent_modes.weight[[1]])  # type: ignore[union-attr]
+
+
+def test_region_mass_of_a_mixture_is_uniform() -> None:
+    """Drawn from the mixture itself, masses are uniform, overlapping modes or not; of one mode it is that of chi square."""
+    rng = np.random.default_rng(0)
+    draws = rng.standard_normal((1000, 2))
+    n = 400
+    for distance in (1.5, 8.0):
+        mean = np.tile([[0.0, 0.0], [distance, 0.0]], (n, 1, 1))
+        modes = LatentModes(np.tile([0.7, 0.3], (n, 1)), mean, np.zeros((n, 2), dtype=int))
+        scale = np.tile([1.0, 0.5], (n, 1))
+        z = mean[np.arange(n), (rng.random(n) > 0.7).astype(int)] + scale * rng.standard_normal((n, 2))
+        mass = modes.region_mass(z, scale, draws)
+        assert abs(mass.mean() - 0.5) < 5 * np.sqrt(1 / 12 / n) + 5 * 0.5 / np.sqrt(1000)
+        inside = np.mean(mass <= 0.9)
+        assert abs(inside - 0.9) < 5 * np.sqrt(0.09 / n) + 5 * np.sqrt(0.09 / 1000)
+    z = rng.standard_normal((50, 2))
+    exact = chi_square_mass(z, np.ones((50, 2)))
+    found = LatentModes.of_one(np.zeros((50, 2))).region_mass(z, np.ones((50, 2)), draws)
+    np.testing.assert_allclose(found, exact, atol=5 * 0.5 / np.sqrt(1000))
+
+
+def test_modes_of_latents_reach_files(tmp_path: Path) -> None:
+    """An object of two likely categories states both modes, one that is sure states none."""
+    seen = mixed().detections(frame=0)
+    np.testing.assert_array_equal(seen.latent_mode_weight, [[0.8, 0.2], [0.0, 0.0]])
+    np.testing.assert_array_equal(seen.latent_mode[0], [[0.0, 1.0], [-3.0, 5.0]])
+    np.testing.assert_array_equal(seen.latent_mode[0, 0], seen.latent[0])
+    check_table(seen, 1)
+    first, second = mixed().to_records(0, "a.png")
+    assert first["latent_modes"] == [{"weight": 0.8, "latent": [0.0, 1.0]}, {"weight": 0.2, "latent": [-3.0, 5.0]}]
+    assert "latent_modes" not in second
+    write_observations(tmp_path / "a.jsonl", seen)
+    back = read_observations(tmp_path / "a.jsonl")
+    np.testing.assert_array_equal(back.latent_mode_weight, seen.latent_mode_weight)
+    np.testing.assert_array_equal(back.latent_mode, seen.latent_mode)
+    sure = mixed()[[1]].detections(frame=1)
+    assert sure.latent_mode_weight.shape == (1, 0) and sure.latent_mode.shape == (1, 0, 2)
+    joined = Detections.concatenate([sure, seen, Detections.from_arrays([3], [[0, 0, 4.0]], id=["x"])])
+    assert joined.latent_mode.shape == (4, 2, 2) and joined.latent_mode_weight.sum() == 1
+    np.testing.assert_array_equal(joined.select(np.array([1])).latent_mode[0], seen.latent_mode[0])

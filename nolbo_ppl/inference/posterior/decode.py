@@ -19,6 +19,7 @@ from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import decode_box, decode_range
+from nolbo_ppl.structures.latent_modes import modes_by_category
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 
@@ -75,15 +76,18 @@ def assemble(
         position, diagonal = decode_range(q.range_loc, box, camera, config)
     rotation_variance = (azimuth_variance + q.angle_scale.square().sum(-1)) / 3
     voxel_mean, voxel_variance, size = shapes(q, diagonal)
+    latent, class_log_posterior = q.shape_loc.numpy(), torch.log_softmax(q.label_logits.double(), -1).numpy()
+    # Without categories, or with one prior for all of them, every category puts the latent at the same place.
+    mixed = config.description.describes and config.description.label_prior and len(config.categories) > 1
     return ObjectPosteriors(
         categories=config.categories,
         objectness=torch.sigmoid(regions.logit.double()).numpy(),
         box=box.numpy() / np.tile(scale, 2),
         box_scale=np.concatenate((box_scale[:, :2].numpy() / scale, box_scale[:, 2:].numpy()), -1),
-        class_log_posterior=torch.log_softmax(q.label_logits.double(), -1).numpy(),
+        class_log_posterior=class_log_posterior,
         class_log_likelihood=category_log_likelihood(q.shape_loc, prior, prior_mean).numpy(),
         instance_log_posterior=instance_log_posterior(q, prior),
-        latent=q.shape_loc.numpy(),
+        latent=latent,
         latent_scale=q.shape_scale.numpy(),
         position=position.double().numpy(),
         position_covariance=position_covariance(q, box, box_scale, position, camera, config).numpy(),
@@ -99,6 +103,7 @@ def assemble(
         voxel_mean=voxel_mean,
         voxel_variance=voxel_variance,
         describes=config.description.describes,
+        latent_modes=modes_by_category(latent, class_log_posterior, prior_mean.numpy()) if mixed else None,
     )
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import nms
 from nolbo_ppl.inference.posterior.predictor import Image, ObservationModel
+from nolbo_ppl.structures.latent_modes import LatentModes
 from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
 
 TRAINED_SIDES = (0.11, 0.94)
@@ -121,9 +122,9 @@ def join(parts: Sequence[ObjectPosteriors]) -> ObjectPosteriors:
         raise input_error("no observations to join", got=0, expected="at least one set")
 
     def together(values: list[Any]) -> Any:
-        if isinstance(values[0], ViewpointModes):
-            names = [field.name for field in dataclasses.fields(ViewpointModes)]
-            return ViewpointModes(*(np.concatenate([getattr(value, name) for value in values]) for name in names))
+        if isinstance(values[0], (ViewpointModes, LatentModes)):
+            names = [field.name for field in dataclasses.fields(values[0])]
+            return type(values[0])(*(np.concatenate([getattr(value, name) for value in values]) for name in names))
         return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
 
     names = [field.name for field in dataclasses.fields(ObjectPosteriors)]
