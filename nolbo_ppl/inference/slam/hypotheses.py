@@ -1,10 +1,10 @@
 """Several maps where one is not sure: runs from different starts, compared by their log evidence.
 
 The first run anneals from the odometry. The second begins with the best whole association of the tracklets
-(`best_associations`), which is searched for quite otherwise. Where the two agree, only associations that come near the best
-have a run too; else up to `SlamConfig.hypotheses` runs: which loops an annealed run closes can depend on its samples and on how
-wide a drift it begins with, so further ones differ in both, and the next best associations have their turns. Runs that end at one
-trajectory are one hypothesis; weights are the shares of the evidence.
+(`best_associations`), which is searched for quite otherwise, or with a wider drift where the odometry's scales are guesses. Where
+the two agree, only associations that come near the best have a run too; else up to `SlamConfig.hypotheses` runs: which loops an
+annealed run closes can depend on its samples and on how wide a drift it begins with, so further ones differ in both, and the next
+best associations have their turns. Runs that end at one trajectory are one hypothesis; weights are the shares of the evidence.
 """
 
 from __future__ import annotations
@@ -159,23 +159,27 @@ def agree(first: Run, second: Run, distance: float, same: float) -> bool:
     return distance < SAME_SHARE * same and abs(counts[0] - counts[1]) <= SAME_COUNT * max(counts)
 
 
-def second_start(state: SlamState, associations: list[WholeAssociation]) -> SlamState:
-    """What the second run begins with: the best association, or another anneal where none was searched for."""
-    return with_association(state, associations[0]) if associations else start_of_run(state, 1)
+def starts_after_first(state: SlamState, associations: list[WholeAssociation]) -> Iterator[SlamState]:
+    """Starts of the runs after the first, without end: anneals and associations in turn.
+
+    Where a scale of the odometry is a guess, an anneal from a drift three times as wide comes first, for the search believes the
+    guess (a small room: 15 landmarks for 15 objects, 21 when the association came first); else the best association does.
+    """
+    anneals = (start_of_run(state, k) for k in count(1))
+    if not all(stated_sigmas(state.problem, state.config)):
+        yield next(anneals)
+    for association in associations:
+        yield with_association(state, association)
+        yield next(anneals)
+    yield from anneals
 
 
-def further_starts(state: SlamState, associations: list[WholeAssociation], settled: bool) -> Iterator[SlamState]:
-    """Starts of the runs after the second: where the first two agree, associations that come near the best alone."""
-    if settled:
-        near = [one for one in associations[1:] if one.log_odds > associations[0].log_odds - RIVAL]
-        yield from (with_association(state, one) for one in near)
-        return
-    anneal = 1 if associations else 2
-    for turn in count(1):
-        yield start_of_run(state, anneal)
-        anneal += 1
-        if turn < len(associations):
-            yield with_association(state, associations[turn])
+def near_rivals(state: SlamState, associations: list[WholeAssociation]) -> Iterator[SlamState]:
+    """Starts of the runs after two that agree: associations that come near the best one, where the search could be believed."""
+    if all(stated_sigmas(state.problem, state.config)):
+        for one in associations[1:]:
+            if one.log_odds > associations[0].log_odds - RIVAL:
+                yield with_association(state, one)
 
 
 def explore(
@@ -194,10 +198,12 @@ def explore(
         runs[0] = run_to_end(state, iterate, on_step)
     if limit > 1 and len(state.static) > 1:
         associations = best_associations(state, count=limit)
-        runs.append(run_to_end(second_start(state, associations), iterate, on_step))
+        starts = starts_after_first(state, associations)
+        runs.append(run_to_end(next(starts), iterate, on_step))
         distance = trajectory_distance(runs[0].state.estimate.T_world_camera, runs[1].state.estimate.T_world_camera)
-        settled = agree(runs[0], runs[1], distance, same)
-        runs += [run_to_end(start, iterate, on_step) for start in islice(further_starts(state, associations, settled), limit - 2)]
+        if agree(runs[0], runs[1], distance, same):
+            starts = near_rivals(state, associations)
+        runs += [run_to_end(start, iterate, on_step) for start in islice(starts, limit - 2)]
     if len(runs) > 2:  # and the map without any loop: runs that disagree may all be wrong
         runs.append(run_to_end(state, lambda start, _: (start, ()), None))
     runs.sort(key=lambda run: -run.log_evidence)

@@ -1,7 +1,7 @@
 """The search for whole associations against every partition of a few tracklets, and on a drive whose annealed run goes wrong."""
 
-from functools import partial
 from itertools import islice, pairwise, product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from nolbo_ppl.inference.slam import best_associations as module
 from nolbo_ppl.inference.slam.best_associations import WholeAssociation, best_associations, search, with_association
 from nolbo_ppl.inference.slam.initialise import init
 from nolbo_ppl.inference.slam.map_evidence import trajectory_distance
+from nolbo_ppl.structures.detections import Detections
 
 FLOOR, LOG_NEW = 0.2, -3.0
 
@@ -132,13 +133,17 @@ def test_long_drives_are_not_searched(lookalikes, monkeypatch):
 
 
 def test_starts_of_further_runs(monkeypatch):
-    """Agreed: what comes near the best alone. Not agreed: anneals and associations in turn, none twice, without end."""
+    """Scales stated: the best association first. Guessed: a wider drift first. Agreed: what comes near the best alone."""
     monkeypatch.setattr(hypotheses, "with_association", lambda state, one: f"association {one.log_odds:g}")
     monkeypatch.setattr(hypotheses, "start_of_run", lambda state, k: f"anneal {k}")
     found = [WholeAssociation(np.zeros(1, int), odds) for odds in (10.0, 7.0, 4.0)]
-    starts = partial(hypotheses.further_starts, None)
-    assert hypotheses.second_start(None, found) == "association 10" and hypotheses.second_start(None, []) == "anneal 1"
-    assert list(starts(found, True)) == ["association 7"]
-    assert list(starts([], True)) == []
-    assert list(islice(starts(found, False), 5)) == ["anneal 1", "association 7", "anneal 2", "association 4", "anneal 3"]
-    assert list(islice(starts([], False), 3)) == ["anneal 2", "anneal 3", "anneal 4"]
+    problem = SlamProblem(np.tile(np.eye(4), (2, 1, 1)), Detections.from_arrays([0], [[0, 0, 4.0]]))
+    guessed = SimpleNamespace(problem=problem, config=SlamConfig())
+    stated = SimpleNamespace(problem=problem, config=SlamConfig(odometry_rotation_scale=0.01, odometry_translation_scale=0.1))
+    after = hypotheses.starts_after_first
+    first = ["association 10", "anneal 1", "association 7", "anneal 2", "association 4", "anneal 3", "anneal 4"]
+    assert list(islice(after(stated, found), 7)) == first
+    assert list(islice(after(guessed, found), 4)) == ["anneal 1", "association 10", "anneal 2", "association 7"]
+    assert list(islice(after(stated, []), 2)) == ["anneal 1", "anneal 2"]
+    assert list(hypotheses.near_rivals(stated, found)) == ["association 7"]
+    assert list(hypotheses.near_rivals(stated, [])) == list(hypotheses.near_rivals(guessed, found)) == []
