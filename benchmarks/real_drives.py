@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from nolbo_ppl.data.converters.kitti_object import CAMERAS, IGNORED, PIXEL_CENTRE, SEEN, KittiLabel
+from nolbo_ppl.data.converters.kitti_object import CAMERAS, IGNORED, PIXEL_CENTRE, SEEN, KittiLabel, read_track_labels
 from nolbo_ppl.data.converters.kitti_raw import camera_poses, step_covariance
 from nolbo_ppl.data.converters.kitti_tracking import car_rotation
 from nolbo_ppl.data.simulate import simulate_odometry
@@ -78,14 +78,8 @@ class Arguments:
 
 
 def labels_of(path: Path) -> list[list[tuple[str, KittiLabel]]]:
-    """Track and label of every object of every frame of a tracking label file, which holds the drive's tracklets."""
-    frames: dict[int, list[tuple[str, KittiLabel]]] = {}
-    for text in path.read_text(encoding="utf-8").splitlines():
-        words = text.split()
-        values = np.array([float(word) for word in words[3:]])
-        label = KittiLabel(words[2], values[0], int(values[1]), values[3:7], values[7:10], values[10:13], float(values[13]))
-        frames.setdefault(int(words[0]), []).append((f"{words[2]} {words[1]}", label))
-    return [frames.get(k, []) for k in range(max(frames) + 1)]
+    """Name and label of every object of every frame of a tracking label file, which holds the drive's tracklets."""
+    return [[(f"{label.kind} {track}", label) for track, label in frame] for frame in read_track_labels(path)]
 
 
 def truth_of(labels: list[list[tuple[str, KittiLabel]]], poses: np.ndarray, kinds: tuple[str, ...]) -> SequenceGroundTruth:

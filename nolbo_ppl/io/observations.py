@@ -2,7 +2,8 @@
 
 One detection a line: `frame` (row of the odometry, from 0) and `position` [x, y, z] m in the camera frame; optional
 `position_std` (a number or 3) or `position_cov` (3x3), `position_tails` [degrees of freedom, factor on the covariance] of
-Student's t about the position, `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
+Student's t about the position, `position_cov_shared` (3x3, the part of the covariance that is one error for all views of
+an object), `rotation` [qx, qy, qz, qw] (R_camera_object), `rotation_std` rad,
 `rotation_modes` (a list of `weight`, `rotation`, `std`: all modes of the orientation), `latent` [d], `latent_std` (a number
 or d), `latent_modes` (a list of `weight`, `latent`: all modes of the latent, each with `latent_std`), `objectness` (default 1),
 `category`, `size` [3] m, `symmetry` (1 none, n n-fold, 0 free about the object's vertical axis), `id`. A model's own lines say
@@ -41,6 +42,7 @@ FIELDS = (
     "position_std",
     "position_cov",
     "position_tails",
+    "position_cov_shared",
     "rotation",
     "rotation_std",
     "rotation_modes",
@@ -193,6 +195,19 @@ def _image_fields(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
+def _shared(value: Any, whole: np.ndarray | None, where: dict[str, Any]) -> np.ndarray:
+    """The part of a position's covariance that all views of an object have in common."""
+    shared = number_array(value, (3, 3), LARGEST_SCALE**2)
+    if shared is None:
+        raise input_error("`position_cov_shared` is no 3x3 matrix", got=value, **where)
+    size = np.abs(shared if whole is None else whole).max()
+    least = min(np.linalg.eigvalsh(part)[0] for part in (shared, shared if whole is None else whole - shared))
+    if np.abs(shared - shared.T).max() > 1e-6 * np.abs(shared).max() or least < -1e-9 * size:
+        expected = "symmetric, eigenvalues of 0 or more, and so of what it leaves of `position_cov`"
+        raise input_error("`position_cov_shared` is no part of a covariance", got=value, expected=expected, **where)
+    return shared
+
+
 def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
     """One checked line: python values by table column."""
     for key in ("frame", "position"):
@@ -223,6 +238,8 @@ def _parse(row: dict[str, Any], where: dict[str, Any]) -> dict[str, Any]:
         if not (tails > 0).all():
             expected = "degrees of freedom and a factor, above 0"
             raise input_error("`position_tails` are no law", got=row["position_tails"], expected=expected, **where)
+    if row.get("position_cov_shared") is not None:
+        out["position_shared"] = _shared(row["position_cov_shared"], out.get("position_covariance"), where)
     if row.get("rotation") is not None:
         out["rotation"] = _rotation(row, where)
     if row.get("rotation_std") is not None:
@@ -322,6 +339,7 @@ def _table(rows: list[dict[str, Any]]) -> Detections:
     shapes = {
         "position": (3,),
         "position_covariance": (3, 3),
+        "position_shared": (3, 3),
         "rotation": (3, 3),
         "latent": (latent,),
         "latent_scale": (latent,),

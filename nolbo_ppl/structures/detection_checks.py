@@ -51,6 +51,21 @@ def check_table(table: Detections, frames: int) -> None:
     bad = np.isnan(table.position_tails).any(axis=1) != np.isnan(table.position_tails).all(axis=1)
     bad |= ~np.isfinite(tails).all(axis=1) | (tails <= 0).any(axis=1)
     refuse(bad, "position_tails are no law", table.position_tails, "degrees of freedom and a factor, above 0")
+    shared = np.where(np.isnan(table.position_shared), 0.0, table.position_shared)
+    stated = shared.any(axis=(1, 2))
+    refuse(~np.isfinite(shared).all(axis=(1, 2)), "shared position covariance is not finite", shared, "finite m^2")
+    skewed = np.abs(shared - np.swapaxes(shared, 1, 2)).max(axis=(1, 2), initial=0) > 1e-6 * np.abs(shared).max(
+        axis=(1, 2), initial=0
+    )
+    refuse(skewed, "shared position covariance is not symmetric", shared, "a symmetric matrix")
+    rest = np.where(given[:, None, None], covariance - shared, shared)  # without a covariance it is part of one that is estimated
+    least = np.minimum(np.linalg.eigvalsh(rest)[:, 0], np.linalg.eigvalsh(shared)[:, 0]) if len(rest) else np.zeros(0)
+    refuse(
+        stated & (least < -1e-9 * np.abs(covariance).max(axis=(1, 2), initial=0)),
+        "shared position covariance is no part of the position covariance",
+        shared,
+        "eigenvalues of 0 or more, of the rest as well",
+    )
     rotation = np.where(table.has_rotation[:, None, None], table.rotation, np.eye(3))
     residual = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2), initial=0)
     refuse(~(residual < 1e-3) | (np.linalg.det(rotation) < 0), "rotation is no rotation", rotation, "orthonormal")

@@ -64,6 +64,8 @@ def _record(d: Detections, i: int, quaternion: np.ndarray, mode_quaternion: np.n
             row["position_cov"] = covariance.tolist()
     if np.isfinite(d.position_tails[i]).all():
         row["position_tails"] = d.position_tails[i].tolist()
+    if np.isfinite(d.position_shared[i]).all():
+        row["position_cov_shared"] = d.position_shared[i].tolist()
     if np.isfinite(d.rotation[i]).all():
         row["rotation"] = quaternion.tolist()
     if np.isfinite(d.rotation_scale[i]):

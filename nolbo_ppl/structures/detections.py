@@ -56,6 +56,9 @@ class Detections:
     """Order of the symmetry about the object's vertical axis (0 free); -1: that of the category."""
     id: tuple[str, ...]
     """Identifiers; the row number where the file had none."""
+    position_shared: Float[np.ndarray, "n 3 3"] = NOT_STATED
+    """The part of `position_covariance` that is one error for all views of an object, in the camera's axes, m^2: views added up
+    do not make it smaller. NaN: none."""
     mode_weight: Float[np.ndarray, "n K"] = NOT_STATED
     """Weights of the modes of the orientation, 0 where there are fewer; K is 0 when nobody states any."""
     mode_rotation: Float[np.ndarray, "n K 3 3"] = NOT_STATED
@@ -151,6 +154,7 @@ class Detections:
         *,
         position_covariance: Any = None,
         position_scale: Any = None,
+        position_shared: Any = None,
         rotation: Any = None,
         rotation_scale: Any = None,
         latent: Any = None,
@@ -175,6 +179,7 @@ class Detections:
             frame: [n] rows of the odometry.
             position: [n, 3] m in the camera frame.
             position_covariance: [n, 3, 3] m^2, or `position_scale` [n, 3], [n] or a number in m.
+            position_shared: [n, 3, 3] m^2, the part of it that all views of an object have in common.
             rotation: [n, 3, 3] R_camera_object.
             latent: [n, d]; `latent_scale` [n, d], [n] or a number.
             mode_weight: [n, K] weights of the orientation's modes (0: no such mode), with `mode_rotation` [n, K, 3, 3] and
@@ -238,6 +243,7 @@ class Detections:
             frame=frame,
             position=full(position, (n, 3), "position").reshape(n, 3),
             position_covariance=full(position_covariance, (n, 3, 3), "position_covariance"),
+            position_shared=full(position_shared, (n, 3, 3), "position_shared"),
             rotation=full(rotation, (n, 3, 3), "rotation"),
             rotation_scale=full(rotation_scale, (n,), "rotation_scale"),
             latent=full(latent, (n, dimension), "latent"),
@@ -286,6 +292,7 @@ TEXTS = ("category", "id", "image")
 ARRAYS = tuple(one.name for one in fields(Detections) if one.name not in (*TEXTS, "class_names"))
 """Fields with a row of numbers for each row."""
 OPTIONAL: dict[str, tuple[int, ...]] = {
+    "position_shared": (3, 3),
     "mode_weight": (0,),
     "mode_rotation": (0, 3, 3),
     "mode_std": (0,),

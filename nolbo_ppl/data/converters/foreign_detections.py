@@ -71,7 +71,11 @@ class ForeignDetections:
         return len(self.frame)
 
     def placed(
-        self, rows: Int[np.ndarray, " k"], position: Float[np.ndarray, "n 3"], covariance: Float[np.ndarray, "n 3 3"]
+        self,
+        rows: Int[np.ndarray, " k"],
+        position: Float[np.ndarray, "n 3"],
+        covariance: Float[np.ndarray, "n 3 3"],
+        shared: Float[np.ndarray, "n 3 3"] | None = None,
     ) -> Detections:
         """Some of the detections as observations for SLAM, with positions in their camera frames, m, that all of them have got.
 
@@ -81,6 +85,7 @@ class ForeignDetections:
             self.frame[rows],
             position[rows],
             position_covariance=covariance[rows],
+            position_shared=None if shared is None else shared[rows],
             rotation=self.rotation[rows],
             objectness=np.clip(self.score[rows], 1e-3, 1 - 1e-3),
             category=[self.category[k] for k in rows],

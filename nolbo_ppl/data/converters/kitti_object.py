@@ -105,23 +105,39 @@ class KittiLabel:
     """Turn about the camera's y axis, rad; 0 faces along x."""
 
 
+def _label(words: list[str], path: str | PathLike[str], number: int) -> KittiLabel:
+    """A type and its numbers. Raises `InputError` naming file and line."""
+    try:
+        values = np.array([float(word) for word in words[1:15]])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != 14 or not np.isfinite(values).all():
+        got = repr(" ".join(words)[:60])
+        raise input_error("not a label", got=got, expected="a type and 14 numbers", file=path, line=number)
+    return KittiLabel(words[0], float(values[0]), int(values[1]), values[3:7], values[7:10], values[10:13], float(values[13]))
+
+
 def read_object_labels(path: str | PathLike[str]) -> list[KittiLabel]:
     """The labels of an image. Raises `InputError` naming file and line."""
-    labels = []
+    lines = enumerate(read_text(path).splitlines(), start=1)
+    return [_label(text.split(), path, number) for number, text in lines if text.strip()]
+
+
+def read_track_labels(path: str | PathLike[str]) -> list[list[tuple[int, KittiLabel]]]:
+    """Track and label of every object of every frame of a drive (lines that begin with frame and track).
+
+    The list ends with the last frame that has a label. Raises `InputError` naming file and line.
+    """
+    frames: dict[int, list[tuple[int, KittiLabel]]] = {}
     for number, text in enumerate(read_text(path).splitlines(), start=1):
         words = text.split()
         if not words:
             continue
-        try:
-            values = np.array([float(word) for word in words[1:15]])
-        except ValueError:
-            values = np.empty(0)
-        if len(values) != 14 or not np.isfinite(values).all():
-            raise input_error("not a label", got=repr(text[:60]), expected="a type and 14 numbers", file=path, line=number)
-        labels.append(
-            KittiLabel(words[0], float(values[0]), int(values[1]), values[3:7], values[7:10], values[10:13], float(values[13]))
-        )
-    return labels
+        if len(words) < 2 or not words[0].isdigit() or not words[1].removeprefix("-").isdigit():
+            expected = "frame and track, whole numbers, before the label"
+            raise input_error("not a label of a track", got=repr(text[:60]), expected=expected, file=path, line=number)
+        frames.setdefault(int(words[0]), []).append((int(words[1]), _label(words[2:], path, number)))
+    return [frames.get(k, []) for k in range(max(frames, default=-1) + 1)]
 
 
 def projected_box(label: KittiLabel, camera: KittiCamera) -> Float[np.ndarray, " 4"]:

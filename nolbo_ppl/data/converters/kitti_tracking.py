@@ -67,12 +67,18 @@ def read_labels(path: str | PathLike[str]) -> tuple[Int[np.ndarray, "k 2"], Floa
         words = text.split()
         if not words:
             continue
-        if len(words) < 17:
-            raise input_error("not a label", got=repr(text[:60]), expected="17 fields", file=path, line=number)
+        try:
+            frame, track = (int(word) for word in words[:2])
+            values = [float(word) for word in words[3:17]]
+        except ValueError:
+            values = []
+        if len(values) != 14 or not np.isfinite(values).all():
+            expected = "frame, track, type and 14 numbers"
+            raise input_error("not a label", got=repr(text[:60]), expected=expected, file=path, line=number)
         if words[2] == "DontCare":
             continue
-        h, x, y, z, rotation = float(words[10]), *(float(w) for w in words[13:17])
-        numbers.append((int(words[0]), int(words[1])))
+        h, x, y, z, rotation = values[7], *values[10:14]
+        numbers.append((frame, track))
         poses.append((x, y - h / 2, z, rotation))
         kinds.append(words[2])
     return np.array(numbers, dtype=np.int64).reshape(-1, 2), np.array(poses).reshape(-1, 4), kinds

@@ -80,7 +80,7 @@ def observations_by_parallax(
     reason[found.score < minimum_score] = "below the score"
     rows = np.flatnonzero((reason == "") & ~placed)
     tall = np.array([heights.get(name, (np.nan, np.nan)) for name in found.category], dtype=np.float64).reshape(-1, 2)
-    position, covariance = found.position.copy(), np.full((n, 3, 3), np.nan)
+    position, (covariance, shared) = found.position.copy(), np.full((2, n, 3, 3), np.nan)
     if found.covariance is not None:
         covariance[placed] = found.covariance[placed]
     area = (int(limit[0]), int(limit[1]))
@@ -96,7 +96,8 @@ def observations_by_parallax(
                 height=tall[now, 0],
                 height_scale=tall[now, 1],
             )
-            position[now], covariance[now], reason[now] = answer.position, answer.covariance, list(answer.reason)
+            position[now], covariance[now], shared[now] = answer.position, answer.covariance, answer.shared
+            reason[now] = list(answer.reason)
     elif len(rows):
         answer = place_boxes(
             found.frame[rows],
@@ -110,6 +111,7 @@ def observations_by_parallax(
             height_scale=tall[rows, 1],
             config=config,
         )
-        position[rows], covariance[rows], reason[rows] = answer.position, answer.covariance, list(answer.reason)
-    table = found.placed(np.flatnonzero(reason == ""), position, covariance)
+        position[rows], covariance[rows], shared[rows] = answer.position, answer.covariance, answer.shared
+        reason[rows] = list(answer.reason)
+    table = found.placed(np.flatnonzero(reason == ""), position, covariance, shared)
     return table, dict(sorted(Counter(name for name in reason.tolist() if name).items()))

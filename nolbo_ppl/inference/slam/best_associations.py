@@ -16,8 +16,9 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.em import make_landmark_equalities
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import add_landmark_equalities, linearise, optimize
+from nolbo_ppl.inference.slam.graph import add_landmark_equalities, optimize
 from nolbo_ppl.inference.slam.initialise import base_graph, inlier_weights
+from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.loop_candidates import PosteriorSamples, feature_log_ratio
 from nolbo_ppl.inference.slam.slam_state import SlamState
 

@@ -14,7 +14,7 @@ from nolbo_ppl.inference.slam.exposures import exposures_of, exposures_of_places
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.frame_model import FrameModel, initial_frame_model
 from nolbo_ppl.inference.slam.frame_model_fit import estimate_frame_model
-from nolbo_ppl.inference.slam.graph import Linearisation
+from nolbo_ppl.inference.slam.linearisation import Linearisation
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 LISTED = 1e-4

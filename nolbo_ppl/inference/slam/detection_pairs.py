@@ -15,7 +15,8 @@ from jaxtyping import Float, Int
 from nolbo_ppl.geometry.pose import inverse, skew, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, weighted_latents
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, inflated
+from nolbo_ppl.inference.slam.graph import inflated
+from nolbo_ppl.inference.slam.linearisation import Linearisation
 from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState

@@ -18,14 +18,9 @@ from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.inference.slam.clusters import clusters_of
 from nolbo_ppl.inference.slam.consistent_cliques import close_constellations
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
-from nolbo_ppl.inference.slam.graph import (
-    UNINFORMATIVE_ROTATION_SIGMA,
-    LandmarkEqualities,
-    add_landmark_equalities,
-    linearise,
-    optimize,
-)
+from nolbo_ppl.inference.slam.graph import UNINFORMATIVE_ROTATION_SIGMA, LandmarkEqualities, add_landmark_equalities, optimize
 from nolbo_ppl.inference.slam.initialise import base_graph, inlier_weights
+from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.loop_candidates import Pairs, TrackletFeatures, candidate_pairs, posterior_samples
 from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
 from nolbo_ppl.inference.slam.orientation import nearest_mode_rotation

@@ -39,3 +39,23 @@ def log_normal(error: Float[np.ndarray, "... 3"], covariance: Float[np.ndarray, 
     """Log density of N(error; 0, S), per m^3."""
     square, log_det = squared_distance(error, covariance)
     return -0.5 * (square + log_det)
+
+
+def upper_root(covariance: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 3 3"]:
+    """Upper triangular roots `U U'` of matrices without negative eigenvalues.
+
+    Of all roots the one that follows the views: its last column is along the ray wherever depth is shared, the others are the
+    image's axes, so that one vector of numbers means one error in all of them.
+
+    >>> upper_root(np.array([[[4.0, 0, 0], [0, 9, 0], [0, 0, 0]]]))[0].tolist()
+    [[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 0.0]]
+    """
+    rest = np.array(covariance, dtype=np.float64)
+    root = np.zeros_like(rest)
+    for i in (2, 1, 0):
+        own = np.sqrt(np.maximum(rest[:, i, i], 0.0))
+        column = np.where(own[:, None] > 0, rest[:, :, i] / np.where(own > 0, own, 1.0)[:, None], 0.0)
+        column[:, i + 1 :] = 0.0
+        root[:, :, i] = column
+        rest = rest - column[:, :, None] * column[:, None, :]
+    return root

@@ -7,14 +7,11 @@ sit in the noise models (scale / sqrt(w)) and are frozen while the graph is solv
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl._moved import renamed
@@ -33,6 +30,8 @@ PRIOR_ROTATION, PRIOR_POSITION_RATIO = 1.0, 1e3
 """Weak prior of each landmark about its first estimate: rad, and the multiple of the typical range in m."""
 FIRM_ROTATION_SIGMA = 1e-2
 """Scale of the prior on the rotation of a landmark without an orientation, rad."""
+MINIMUM_WEIGHT = 1e-3
+"""Observations of no more weight are left out of the graph."""
 GAUGE_SCALE = 1e-5
 """Scale of the prior that fixes the first pose, rad and m."""
 
@@ -181,7 +180,10 @@ def odometry_rows(steps: int, noise: NoiseModel) -> int:
 
 
 def add_observation_factors(
-    graph: gtsam.NonlinearFactorGraph, factors: ObservationFactors, minimum: float = 1e-3, robust_width: float | None = None
+    graph: gtsam.NonlinearFactorGraph,
+    factors: ObservationFactors,
+    minimum: float = MINIMUM_WEIGHT,
+    robust_width: float | None = None,
 ) -> None:
     """One factor a detection, its covariance divided by its weight; weights below `minimum` are left out.
 
@@ -285,106 +287,6 @@ def optimize(
         return estimate, before, before
     scales = None if estimate.scale is None else len(estimate.scale)
     return from_values(result, len(estimate.T_world_camera), len(estimate.T_world_landmark), scales), before, after
-
-
-@dataclass(frozen=True)
-class Linearisation:
-    """A linearised graph, factorised once: samples, marginals and joint covariances of any variables.
-
-    Columns of the system: landmarks in order, then poses in order (GTSAM sorts its keys: 'l' before 'x'), six each; then the
-    scales of the odometry's steps ('z'), where they are a state.
-    """
-
-    landmarks: int
-    """Number of landmarks."""
-    poses: int
-    """Number of poses."""
-    jacobian: scipy.sparse.csc_matrix
-    """Whitened Jacobian."""
-    factor: scipy.sparse.linalg.SuperLU
-    """Factorisation of its normal matrix."""
-    residual: np.ndarray
-    """Whitened residuals at the point of linearisation, one a row of the Jacobian."""
-
-    def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
-        """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""
-        noise = rng.standard_normal((self.jacobian.shape[0], count))
-        blocks = 6 * (self.landmarks + self.poses)
-        delta = self.factor.solve(self.jacobian.T @ noise)[:blocks].reshape(-1, 6, count)
-        return delta[self.landmarks :], delta[: self.landmarks]
-
-    def residual_samples(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "r s"]:
-        """Whitened residuals that the model itself expects after the fit: `e - J (J'J)^-1 J' e` for e of N(0, I).
-
-        Their mean square is one less the row's leverage; it is sampled without cancellation where a fit takes nearly all away.
-        """
-        noise = rng.standard_normal((self.jacobian.shape[0], count))
-        return noise - self.jacobian @ self.factor.solve(self.jacobian.T @ noise)
-
-    def _inverse_columns(self, columns: Int[np.ndarray, " c"]) -> Iterator[tuple[slice, Float[np.ndarray, "s p"]]]:
-        """Columns of the inverse of the normal matrix, 64 blocks of six at a time, with the slice of `columns` that they are."""
-        for start in range(0, len(columns), 384):
-            part = slice(start, min(start + 384, len(columns)))
-            right = np.zeros((self.jacobian.shape[1], part.stop - start))
-            right[columns[part], np.arange(part.stop - start)] = 1.0
-            yield part, self.factor.solve(right)
-
-    def covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 6"]:
-        """Marginal covariances of the given blocks (landmark j: j; pose i: landmarks + i)."""
-        blocks = np.asarray(blocks, dtype=np.int64)
-        columns = 6 * blocks[:, None] + np.arange(6)
-        out = np.empty((len(blocks), 6, 6))
-        for part, solution in self._inverse_columns(columns.ravel()):
-            own = np.arange(part.start, part.stop).reshape(-1, 6)
-            out[own[:, 0] // 6] = solution[columns[own[:, 0] // 6][:, :, None], own[:, None] - part.start]
-        return 0.5 * (out + np.swapaxes(out, 1, 2))
-
-    def joint_covariance(self, blocks: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 6 b 6"]:
-        """Joint covariance of the given blocks, numbered as in `covariance`; what two of them share is off the diagonal."""
-        blocks = np.asarray(blocks, dtype=np.int64)
-        columns = (6 * blocks[:, None] + np.arange(6)).ravel()
-        out = np.empty((len(columns), len(columns)))
-        for part, solution in self._inverse_columns(columns):
-            out[:, part] = solution[columns]
-        return (0.5 * (out + out.T)).reshape(len(blocks), 6, len(blocks), 6)
-
-    def scale_deviations(self) -> Float[np.ndarray, " n-1"]:
-        """Standard deviations of the scales of the odometry's steps; none where they are no state."""
-        first, size = 6 * (self.landmarks + self.poses), self.jacobian.shape[1]
-        variance = np.empty(size - first)
-        for part, solution in self._inverse_columns(np.arange(first, size)):
-            variance[part] = solution[first:][part].diagonal()
-        return np.sqrt(np.maximum(variance, 0.0))
-
-    def log_determinant(self) -> float:
-        """Log determinant of the normal matrix."""
-        return float(np.sum(np.log(np.abs(self.factor.U.diagonal()))))
-
-
-def linearise(graph: gtsam.NonlinearFactorGraph, estimate: SlamEstimate) -> Linearisation:
-    """Linearise at an estimate and factorise the normal matrix (SuperLU without pivoting: it is positive definite).
-
-    Raises:
-        GraphError: the system is indeterminate.
-    """
-    try:
-        rows, columns, entries = graph.linearize(to_values(estimate)).sparseJacobian_()
-    except RuntimeError as error:
-        raise named_error(error) from None
-    size = 6 * (len(estimate.T_world_camera) + len(estimate.T_world_landmark))
-    size += 0 if estimate.scale is None else len(estimate.scale)
-    system = scipy.sparse.csc_matrix((entries, (rows.astype(np.int64) - 1, columns.astype(np.int64) - 1)))
-    jacobian = system[:, :size]
-    # The last column is the right-hand side; GTSAM leaves it out where all residuals are zero.
-    residual = -system[:, size].toarray().ravel() if system.shape[1] > size else np.zeros(system.shape[0])
-    normal = (jacobian.T @ jacobian).tocsc()
-    try:
-        factor = scipy.sparse.linalg.splu(
-            normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-    except RuntimeError as error:
-        raise GraphError(f"the linearised graph is indeterminate: {error}") from None
-    return Linearisation(len(estimate.T_world_landmark), len(estimate.T_world_camera), jacobian, factor, residual)
 
 
 if not TYPE_CHECKING:  # type checkers know the new names alone

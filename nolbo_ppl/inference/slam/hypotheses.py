@@ -20,11 +20,11 @@ from nolbo_ppl.geometry.pose import relative, se3_log
 from nolbo_ppl.inference.slam.best_associations import WholeAssociation, best_associations, with_association
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.em import EmStepInfo
-from nolbo_ppl.inference.slam.graph import SlamEstimate, linearise
-from nolbo_ppl.inference.slam.initialise import base_graph
+from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
 from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.noise.odometry_noise import stated_sigmas
+from nolbo_ppl.inference.slam.shared_errors import linearise_answer
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
 DRIFT_FACTORS = (1.0, 3.0, 0.5, 6.0)
@@ -67,7 +67,7 @@ class MapHypothesis:
 
     def pose_covariances(self, rows: np.ndarray) -> Float[np.ndarray, "r 6 6"]:
         """Covariances of its poses given its associations."""
-        linearisation = linearise(base_graph(self.state), self.state.estimate)
+        linearisation = linearise_answer(self.state)
         return linearisation.covariance(linearisation.landmarks + rows)
 
 

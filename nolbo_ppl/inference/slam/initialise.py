@@ -17,14 +17,8 @@ from nolbo_ppl.inference.slam.detection_features import (
     weighted_latents,
 )
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
-from nolbo_ppl.inference.slam.graph import (
-    LandmarkEqualities,
-    Linearisation,
-    SlamEstimate,
-    add_landmark_equalities,
-    linearise,
-    optimize,
-)
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate, add_landmark_equalities, optimize
+from nolbo_ppl.inference.slam.linearisation import Linearisation, linearise
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.absurd_values import without_absurd_values

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import squared_distance
-from nolbo_ppl.inference.slam.graph import LandmarkEqualities, Linearisation, SlamEstimate
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate
+from nolbo_ppl.inference.slam.linearisation import Linearisation
 from nolbo_ppl.inference.slam.orientation import orientation_log_density
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.geometry.pose import inverse, relative, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_latent, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
-from nolbo_ppl.inference.slam.graph import Linearisation, linearise, odometry_rows
+from nolbo_ppl.inference.slam.graph import odometry_rows
 from nolbo_ppl.inference.slam.initialise import base_graph
+from nolbo_ppl.inference.slam.linearisation import Linearisation, linearise
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState
 

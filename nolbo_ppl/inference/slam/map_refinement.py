@@ -14,7 +14,7 @@ from nolbo_ppl.inference.slam.data_association import Associations, associate_de
 from nolbo_ppl.inference.slam.em import make_landmark_equalities
 from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
-from nolbo_ppl.inference.slam.graph import LandmarkEqualities, linearise, optimize
+from nolbo_ppl.inference.slam.graph import LandmarkEqualities, optimize
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
     base_graph,
@@ -23,6 +23,7 @@ from nolbo_ppl.inference.slam.initialise import (
     linearise_state,
     tracklet_features,
 )
+from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.loop_candidates import Pairs, candidate_pairs, posterior_samples
 from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry, settle_odometry
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.geometry.pose import transform
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_features
+from nolbo_ppl.inference.slam.gaussian import upper_root
 from nolbo_ppl.inference.slam.orientation import OrientationModes, observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 from nolbo_ppl.structures.detections import Detections
@@ -29,6 +30,9 @@ class Measurements:
     """Position in the frame the rest is in (the camera's, or the world's after `in_world`), m."""
     covariance: Float[np.ndarray, "n 3 3"]
     """Its covariance, m^2."""
+    shared_root: Float[np.ndarray, "n 3 3"]
+    """Root of the part of it that is one error for all views of an object, in the camera's axes, m: one vector of three standard
+    normal numbers an object, seen through this."""
     oriented: Bool[np.ndarray, " n"]
     """Whether an orientation is observed."""
     modes: OrientationModes
@@ -83,6 +87,7 @@ def resolve(table: Detections, noise: NoiseModel, config: SlamConfig, prior: Fea
         frame=table.frame,
         position=table.position,
         covariance=noise.position_covariance,
+        shared_root=upper_root(np.nan_to_num(table.position_shared)),
         oriented=table.has_rotation,
         modes=observed_modes(table, noise.rotation_scale),
         symmetry=resolved_symmetry(table, config),

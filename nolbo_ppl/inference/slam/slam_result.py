@@ -15,11 +15,13 @@ from nolbo_ppl.inference.slam.class_posterior import ConfusionModel, class_poste
 from nolbo_ppl.inference.slam.data_association import Associations
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE
 from nolbo_ppl.inference.slam.em import EmStepInfo
-from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate, linearise, to_values
+from nolbo_ppl.inference.slam.graph import SlamEstimate, to_values
 from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, mixture_covariances
 from nolbo_ppl.inference.slam.landmark_shapes import LatentDecoder, Voxels, decode_landmarks
+from nolbo_ppl.inference.slam.linearisation import Linearisation
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence
 from nolbo_ppl.inference.slam.map_refinement import final_graph
+from nolbo_ppl.inference.slam.shared_errors import linearise_answer
 from nolbo_ppl.inference.slam.slam_state import SlamState
 from nolbo_ppl.structures.landmark import Landmark
 
@@ -75,8 +77,8 @@ class SlamResult:
 
     @cached_property
     def linearisation(self) -> Linearisation:
-        """The final graph linearised at the answer."""
-        return linearise(self.graph, self.state.estimate)
+        """The final graph linearised at the answer, with the errors that the views of an object share."""
+        return linearise_answer(self.state)
 
     def pose_covariances(self, rows: Int[np.ndarray, " r"] | None = None) -> Float[np.ndarray, "r 6 6"]:
         """Covariances of poses, [rotation rad, position m] in the camera's own frame, the first pose held fixed.

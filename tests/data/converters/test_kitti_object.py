@@ -20,8 +20,10 @@ from nolbo_ppl.data.converters.kitti_object import (
     projected_box,
     read_calibration,
     read_object_labels,
+    read_track_labels,
     scene_box,
 )
+from nolbo_ppl.data.converters.kitti_tracking import read_labels
 from nolbo_ppl.data.dataset_folder import SceneFolder
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.evaluation.labelled_scenes import FolderScenes
@@ -183,3 +185,21 @@ def test_regions_to_ignore_are_checked(tmp_path: Path, ignore: str, message: str
         SceneFolder(tmp_path / "out")
     file.write_text(json.dumps({**row, "ignore": None}))
     assert SceneFolder(tmp_path / "out").records[0].ignore.shape == (0, 4)
+
+
+def test_labels_of_a_drive_by_track(tmp_path: Path) -> None:
+    """Frame and track before the label; frames without one are empty; what is wrong is named with file and line."""
+    file = tmp_path / "0000.txt"
+    file.write_text(f"0 -1 {REGION}\n2 3 {CAR.format(ry='0.5')}\n\n2 5 {CAR.format(ry='0.7')}\n")
+    frames = read_track_labels(file)
+    assert [[(track, label.kind, label.rotation_y) for track, label in frame] for frame in frames] == [
+        [(-1, "DontCare", -10.0)],
+        [],
+        [(3, "Car", 0.5), (5, "Car", 0.7)],
+    ]
+    for bad in ("x 3 " + CAR.format(ry="0"), "1.5 3 " + CAR.format(ry="0"), "0", "0 1 Car 1 2", "0 1 " + CAR.format(ry="left")):
+        file.write_text(f"0 -1 {REGION}\n{bad}\n")
+        with pytest.raises(InputError, match=r"0000\.txt:2: not a label"):
+            read_track_labels(file)
+        with pytest.raises(InputError, match=r"0000\.txt:2: not a label"):
+            read_labels(file)

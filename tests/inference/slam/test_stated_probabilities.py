@@ -19,8 +19,8 @@ from nolbo_ppl.inference.slam.detection_features import fit_prior, latent_log_de
 from nolbo_ppl.inference.slam.detection_pairs import detection_pairs
 from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
-from nolbo_ppl.inference.slam.graph import linearise
 from nolbo_ppl.inference.slam.initialise import base_graph
+from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.io.observations import Detections

@@ -21,7 +21,10 @@ from nolbo_ppl.inference.slam.boxes.box_triangulation import triangulate
 SHARE = 3.0
 """How wide along the ray: 1 / SHARE^2 is the part of the information on depth that is counted twice."""
 CENTRE_SHARE = 0.05
-"""Standard deviation of a box's centre from the object's, in parts of the box."""
+"""Standard deviation of a box's centre from the object's, in parts of the box, ..."""
+SHARED_CENTRE = 0.03
+"""... and the part of it that all views of an object have in common: a box's centre is not the projection of the object's.
+Looking again does not average it out."""
 MIN_PIXELS = 1.0
 """Least standard deviation of a box's centre, px."""
 MISFIT = 3.0
@@ -38,6 +41,8 @@ class BoxPlacement:
     """Camera frame, m; NaN where there is none."""
     covariance: Float[np.ndarray, "n 3 3"]
     """m^2."""
+    shared: Float[np.ndarray, "n 3 3"]
+    """The part of it that is one error for all views of an object, m^2."""
     track: Int[np.ndarray, " n"]
     """Number of the track."""
     reason: tuple[str, ...]
@@ -77,7 +82,8 @@ def rays_of(
     tall = extent[:, 1] / intrinsics[1]
     return BoxRays(
         direction=(centre - intrinsics[2:]) / intrinsics[:2],
-        scale=np.maximum(CENTRE_SHARE * extent, MIN_PIXELS) / intrinsics[:2],
+        scale=np.maximum(CENTRE_SHARE * extent, np.hypot(MIN_PIXELS, SHARED_CENTRE * extent)) / intrinsics[:2],
+        shared=SHARED_CENTRE * extent / intrinsics[:2],
         height=tall,
         category=np.array([names.index(name) for name in category], dtype=np.int64),
         depth=height / tall,
@@ -87,15 +93,15 @@ def rays_of(
 
 def _observation(
     rays: BoxRays, row: int, z: float, spread: float, views: int
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
-    """Position and covariance of one view of a track of so many, whose depth's relative spread without the height is known."""
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
+    """Position, covariance and its shared part of one view of a track; `spread`: of the depth without heights."""
     unit = np.array([*rays.direction[row], 1.0])
     information = 1 / (SHARE**2 * views * (spread * z) ** 2)
     if np.isfinite(rays.depth[row]):
         information += 1 / (views * (rays.depth_scale[row] * z) ** 2)
     along = unit / np.sqrt(information)
     across = np.diag([*(z * rays.scale[row]), 1e-3 * z]) ** 2
-    return z * unit, across + np.outer(along, along)
+    return z * unit, across + np.outer(along, along), np.diag([*(z * rays.shared[row]), 0.0]) ** 2
 
 
 def place_boxes(
@@ -139,15 +145,19 @@ def place_boxes(
     rays = rays_of(box, category, intrinsics, centre, height, height_scale)
     view = float(np.prod(np.array(size) / intrinsics[:2]))
     track = track_boxes(frame, rays, T_world_camera, config, view)
-    position, covariance = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+    position, (covariance, shared) = np.full((n, 3), np.nan), np.full((2, n, 3, 3), np.nan)
+    own = np.sqrt(rays.scale**2 - rays.shared**2)
     reason = np.full(n, "seen too rarely", dtype=object)
     kept = long_enough(track, config.minimum_views)
     order = np.flatnonzero(kept)[np.argsort(track[kept], kind="stable")]
     for rows in np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []:
         poses = T_world_camera[frame[rows]]
         begin, prior = _beginning(rays, rows, config)
-        found = triangulate(poses, rays.direction[rows], rays.scale[rows], begin, prior)
-        free = found if prior is None else triangulate(poses, rays.direction[rows], rays.scale[rows], begin)
+        seen = (poses, rays.direction[rows], own[rows], begin)
+        steps = np.diff(frame[rows]), np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        drift = np.column_stack([config.rotation_drift * np.sqrt(steps[0]), config.translation_drift * steps[1]])
+        found = triangulate(*seen, prior, rays.shared[rows], drift)
+        free = found if prior is None else triangulate(*seen, None, rays.shared[rows], drift)
         z = np.einsum("ni,ni->n", found.position - poses[:, :3, 3], poses[:, :3, 2])
         if found.misfit > MISFIT or (z <= 0.5 * config.nearest).any():
             reason[rows] = "not one static object"
@@ -156,8 +166,9 @@ def place_boxes(
         else:
             reason[rows] = ""
             for row, depth in zip(rows, z):
-                position[row], covariance[row] = _observation(rays, int(row), float(depth), free.depth_spread, len(rows))
-    return BoxPlacement(position, covariance, track, tuple(reason.tolist()))
+                placed = _observation(rays, int(row), float(depth), free.depth_spread, len(rows))
+                position[row], covariance[row], shared[row] = placed
+    return BoxPlacement(position, covariance, shared, track, tuple(reason.tolist()))
 
 
 def _beginning(rays: BoxRays, rows: np.ndarray, config: BoxConfig) -> tuple[np.ndarray, tuple[float, float] | None]:
@@ -215,7 +226,7 @@ class BoxPlacer:
         rays = replace(rays, category=numbers)  # the same in every frame
         track = self.tracker.step(T_world_camera, self._frame, rays)
         self._frame += 1
-        position, covariance = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+        position, (covariance, shared) = np.full((n, 3), np.nan), np.full((2, n, 3, 3), np.nan)
         reason = ["seen too rarely"] * n
         for row in range(n):
             z, scale, views = self.tracker.depth_of(int(track[row]), T_world_camera)
@@ -225,5 +236,5 @@ class BoxPlacer:
                 reason[row] = "too little parallax"
                 continue
             reason[row] = ""
-            position[row], covariance[row] = _observation(rays, row, z, scale / z, views)
-        return BoxPlacement(position, covariance, track, tuple(reason))
+            position[row], covariance[row], shared[row] = _observation(rays, row, z, scale / z, views)
+        return BoxPlacement(position, covariance, shared, track, tuple(reason))

@@ -62,6 +62,8 @@ class BoxRays:
     """(x / z, y / z) of where the object's centre is seen."""
     scale: Float[np.ndarray, "n 2"]
     """Its standard deviations."""
+    shared: Float[np.ndarray, "n 2"]
+    """The part of them that is one error for all views of an object."""
     height: Float[np.ndarray, " n"]
     """Height of the box."""
     category: Int[np.ndarray, " n"]
@@ -76,7 +78,7 @@ class BoxRays:
 
     def select(self, rows: np.ndarray) -> BoxRays:
         """Some of them."""
-        names = ("direction", "scale", "height", "category", "depth", "depth_scale")
+        names = ("direction", "scale", "shared", "height", "category", "depth", "depth_scale")
         return BoxRays(*(getattr(self, name)[rows] for name in names))
 
 

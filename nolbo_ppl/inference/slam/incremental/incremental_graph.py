@@ -356,7 +356,7 @@ class IncrementalGraph:
 
     def landmark_covariance(self, number: int) -> Float[np.ndarray, "6 6"]:
         """Covariance of a landmark, [rotation rad, position m] in its own frame, the first pose held fixed."""
-        return np.asarray(self.isam.marginalCovariance(landmark_key(number)))
+        return np.array(self.isam.marginalCovariance(landmark_key(number)))
 
     def pose_covariance(self, frame: int) -> Float[np.ndarray, "6 6"]:
         """Covariance of a pose, [rotation rad, position m] in the camera's frame; that of the pose it hangs on, carried."""

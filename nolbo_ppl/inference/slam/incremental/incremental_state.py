@@ -35,9 +35,9 @@ from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.renamed_options import current_names, stored_names
 from nolbo_ppl.structures.detections import ARRAYS, TEXTS, Detections
 
-VERSION = 1
+VERSION = 2
 """Version of the file."""
-LANDMARK_ARRAYS = ("latent", "latent_variance", "votes", "size", "information")
+LANDMARK_ARRAYS = ("latent", "latent_variance", "votes", "size", "information", "shared", "own")
 LANDMARK_NUMBERS = (
     "number",
     "place",

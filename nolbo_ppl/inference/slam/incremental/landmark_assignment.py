@@ -133,6 +133,7 @@ def _add_factors(
         measurements.covariance[rows],
         (measurements.log_object - measurements.log_clutter)[rows],
         noise,
+        measurements.shared_root[rows],
     )
 
 

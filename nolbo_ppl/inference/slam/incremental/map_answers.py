@@ -39,7 +39,8 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
     out = []
     for row, landmark in enumerate(landmarks):
         T = graph.landmark(landmark.number)
-        covariance = graph.landmark_covariance(landmark.number)
+        covariance, R = graph.landmark_covariance(landmark.number), T[:3, :3]
+        covariance[3:, 3:] += R.T @ landmark.shared_covariance() @ R
         known = len(variance[row]) > 0 and bool(variance[row, 0] < LARGE_VARIANCE)
         out.append(
             Landmark(
@@ -47,7 +48,7 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
                 index=landmark.number,
                 T_world_object=T,
                 covariance=covariance,
-                position_covariance=T[:3, :3] @ covariance[3:, 3:] @ T[:3, :3].T,
+                position_covariance=R @ covariance[3:, 3:] @ R.T,
                 oriented=landmark.oriented,
                 existence=float(1.0 / (1.0 + np.exp(-np.clip(landmark.log_odds, -700, 700)))),
                 class_posterior=classes[row],

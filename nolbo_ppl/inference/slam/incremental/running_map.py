@@ -66,6 +66,10 @@ class RunningLandmark:
     """Log ratio of its detections as those of an object to those of background, its position aside."""
     information: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """Sum of the information of its detections in the world frame, m^-2."""
+    shared: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
+    """Sum of what the error that all its views share adds to them, by their information in the world frame, m^-2 m."""
+    own: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
+    """Sum of the squares of the same, view by view: what `information` counts already."""
     frames: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_FRAMES))
     """Newest frames it was detected in."""
     passes: int = 1
@@ -99,8 +103,19 @@ class RunningLandmark:
         self.size, self.sizes = self.size + other.size, self.sizes + other.sizes
         self.log_odds += other.log_odds
         self.information = self.information + other.information
+        self.shared, self.own = self.shared + other.shared, self.own + other.own
         self.frames = deque(sorted({*self.frames, *other.frames})[-MAX_FRAMES:], maxlen=MAX_FRAMES)
         self.passes += other.passes
+
+    def shared_covariance(self) -> Float[np.ndarray, "3 3"]:
+        """What the error that all views share adds to the covariance of the position in the world frame, m^2.
+
+        As `shared_errors` has it, but for the poses, which are taken as known.
+        """
+        if not self.shared.any():
+            return np.zeros((3, 3))
+        inverted = np.linalg.inv(self.information)
+        return np.asarray(inverted @ (self.shared @ self.shared.T - self.own) @ inverted)
 
     def together_with(self, other: RunningLandmark) -> bool:
         """Whether both were detected in one frame of late: then they are two objects."""
@@ -134,6 +149,7 @@ def count_detections(
     covariance: Float[np.ndarray, "k 3 3"],
     score: Float[np.ndarray, " k"],
     noise: NoiseModel,
+    shared_root: Float[np.ndarray, "k 3 3"] | None = None,
 ) -> None:
     """Evidence of detections of one keyframe that their landmarks are objects rather than background (see `map_answers`).
 
@@ -143,6 +159,7 @@ def count_detections(
         covariance: of the observed positions in the camera frame, m^2.
         score: log likelihood ratio of each detection's score, object over clutter.
         noise: the rates.
+        shared_root: root of what all views of an object err by alike, in the camera frame, m; nothing by default.
     """
     ratio = score - np.log(noise.clutter_intensity)
     information = np.array([j.information for j in landmarks])
@@ -151,10 +168,13 @@ def count_detections(
     value = ratio + log_normal(error, covariance + R_world_camera.T @ spread @ R_world_camera)
     value = np.logaddexp(np.log1p(-RIGHT_TRACK), np.log(RIGHT_TRACK) + value)
     value = np.where(known, value, ratio + np.log(noise.birth_intensity))
-    more = R_world_camera @ np.linalg.inv(covariance) @ R_world_camera.T
+    inverted = np.linalg.inv(covariance)
+    more = R_world_camera @ inverted @ R_world_camera.T
+    alike = R_world_camera @ inverted @ (np.zeros_like(covariance) if shared_root is None else shared_root)
     for k, landmark in enumerate(landmarks):
         landmark.log_odds += float(value[k])
         landmark.information = landmark.information + more[k]
+        landmark.shared, landmark.own = landmark.shared + alike[k], landmark.own + alike[k] @ alike[k].T
 
 
 def stated_variance(landmarks: list[RunningLandmark], correlation: float) -> Float[np.ndarray, "m d"]:

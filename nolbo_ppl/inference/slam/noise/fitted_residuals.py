@@ -15,12 +15,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.graph import (
+    MINIMUM_WEIGHT,
     UNINFORMATIVE_ROTATION_SIGMA,
     ObservationFactors,
     add_landmark_equalities,
-    linearise,
     odometry_rows,
 )
+from nolbo_ppl.inference.slam.linearisation import linearise
+from nolbo_ppl.inference.slam.shared_errors import error_root
 from nolbo_ppl.inference.slam.slam_state import SlamState, measured_graph
 
 SAMPLES = 48
@@ -67,9 +69,11 @@ def fitted_residuals(state: SlamState, rng: np.random.Generator, count: int = SA
     """
     graph, factors = whole_graph(state)
     linearisation = linearise(graph, state.estimate)
+    # What all views of an object err by alike is expected: no sign of scales that are too small.
+    linearisation = linearisation.with_errors(error_root(state, factors, linearisation.jacobian.shape[0]))
     expected = linearisation.residual_samples(count, rng)
     steps = len(state.problem) - 1
-    kept = np.flatnonzero(factors.weight > 1e-3)  # those add_observation_factors takes
+    kept = np.flatnonzero(factors.weight > MINIMUM_WEIGHT)  # those add_observation_factors takes
     middle, begin = 6 * (steps + 1), odometry_rows(steps, state.noise)
     end = begin + 6 * len(kept)
     index = factors.index[kept]

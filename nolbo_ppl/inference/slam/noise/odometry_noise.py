@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from nolbo_ppl.inference.slam.graph import Linearisation, SlamEstimate
+from nolbo_ppl.inference.slam.graph import SlamEstimate
+from nolbo_ppl.inference.slam.linearisation import Linearisation
 from nolbo_ppl.inference.slam.noise.fitted_residuals import squared_ratio
 from nolbo_ppl.inference.slam.noise.neighbour_gaps import SURE_GAIN
 from nolbo_ppl.inference.slam.noise.noise_estimation import TOO_SMALL, step_sigmas

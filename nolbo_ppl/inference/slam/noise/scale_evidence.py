@@ -17,7 +17,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from nolbo_ppl.inference.slam.graph import linearise
+from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.noise.fitted_residuals import whole_graph
 from nolbo_ppl.inference.slam.slam_state import SlamState
 

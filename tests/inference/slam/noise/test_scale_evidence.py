@@ -9,7 +9,7 @@ import pytest
 
 from nolbo_ppl.data.simulate import DetectorConfig, WorldConfig, simulate_circuit, simulate_sequence
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, solve_with_associations
-from nolbo_ppl.inference.slam.graph import linearise
+from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.noise.fitted_residuals import block_ratio, fitted_residuals, halves_of_tracks, whole_graph
 from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry
 from nolbo_ppl.inference.slam.noise.scale_evidence import BIAS_RATIO, BIAS_ROTATION, scale_evidence, scale_posterior
