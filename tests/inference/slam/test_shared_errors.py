@@ -86,10 +86,10 @@ def test_covariance_is_the_sandwich() -> None:
 
 
 def test_stated_regions_hold_the_objects() -> None:
-    """120 worlds: the normalised squared error is that of three degrees of freedom; without the shared part it is far above."""
+    """40 worlds: the normalised squared error is that of three degrees of freedom; without the shared part it is far above."""
     rng = np.random.default_rng(4)
     honest, naive = [], []
-    for _ in range(120):
+    for _ in range(40):
         state = solved(rng)
         gap = state.estimate.T_world_landmark[:, :3, 3] - OBJECTS
         R = state.estimate.T_world_landmark[:, :3, :3]
@@ -97,7 +97,7 @@ def test_stated_regions_hold_the_objects() -> None:
         for found, out in ((answer, honest), (answer.with_errors(None), naive)):
             C = R @ found.covariance(np.arange(3))[:, 3:, 3:] @ np.swapaxes(R, 1, 2)
             out.append(np.einsum("mi,mij,mj->m", gap, np.linalg.inv(C), gap))
-    error = 5 * np.sqrt(2 / 3 / 360) * 1.5  # objects of a world share its poses
+    error = 5 * np.sqrt(2 / 3 / 120) * 1.5  # objects of a world share its poses
     assert abs(np.mean(honest) / 3 - 1) < error
     assert np.mean(naive) / 3 > 2
 

@@ -69,16 +69,16 @@ def test_spreads_hold_what_all_views_err_by_alike() -> None:
     rng = np.random.default_rng(3)
     T, scale, shared = views(9, 1.5), np.full((9, 2), 0.004), np.full((9, 2), 0.012)
     inside, naive = [], []
-    for _ in range(250):
+    for _ in range(100):
         point = np.array([rng.uniform(-2, 2), rng.uniform(-1, 1), rng.uniform(4, 12)])
         seen = directions(T, point) + scale * rng.standard_normal((9, 2)) + shared * rng.standard_normal(2)
         for found, out in (
-            (triangulate(T, seen, scale, np.geomspace(1, 50, 8), shared=shared), inside),
-            (triangulate(T, seen, np.hypot(scale, shared), np.geomspace(1, 50, 8)), naive),
+            (triangulate(T, seen, scale, np.geomspace(3, 12, 4), shared=shared), inside),
+            (triangulate(T, seen, np.hypot(scale, shared), np.geomspace(3, 12, 4)), naive),
         ):
             gap = found.position - point
             out.append(gap @ np.linalg.solve(found.covariance, gap) < 6.251)
-    assert abs(np.mean(inside) - 0.9) < 5 * np.sqrt(0.09 / 250)
+    assert abs(np.mean(inside) - 0.9) < 5 * np.sqrt(0.09 / 100)
     assert np.mean(naive) < 0.75
 
 
@@ -88,16 +88,16 @@ def test_spreads_hold_the_drift_of_the_odometry() -> None:
     T, scale = views(9, 1.5), np.full((9, 2), 0.003)
     steps, drift = relative(T[:-1], T[1:]), np.tile([0.004, 0.02], (8, 1))
     inside, naive = [], []
-    for _ in range(250):
+    for _ in range(100):
         point = np.array([rng.uniform(-2, 2), rng.uniform(-1, 1), rng.uniform(4, 8)])
         seen = directions(T, point) + scale * rng.standard_normal((9, 2))
         odometry = chain(T[0], steps @ se3_exp(np.repeat(drift, 3, axis=1) * rng.standard_normal((8, 6))))
         true = transform(odometry[4] @ inverse(T[4]), point)
         for stated, out in ((drift, inside), (None, naive)):
-            found = triangulate(odometry, seen, scale, np.geomspace(1, 50, 8), drift=stated)
+            found = triangulate(odometry, seen, scale, np.geomspace(3, 12, 4), drift=stated)
             gap = 1 / transform(inverse(odometry[4]), found.position)[2] - 1 / transform(inverse(odometry[4]), true)[2]
             out.append(abs(gap) < 1.645 * found.depth_spread / transform(inverse(odometry[4]), found.position)[2])
-    assert abs(np.mean(inside) - 0.9) < 5 * np.sqrt(0.09 / 250)
+    assert abs(np.mean(inside) - 0.9) < 5 * np.sqrt(0.09 / 100)
     assert np.mean(naive) < 0.75
 
 

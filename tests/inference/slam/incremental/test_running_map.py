@@ -82,6 +82,7 @@ def observed(rng: np.random.Generator, n: int) -> tuple[Measurements, np.ndarray
         frame=np.arange(n),
         position=rng.standard_normal((n, 3)),
         covariance=np.tile(0.01 * np.eye(3), (n, 1, 1)),
+        shared_root=np.zeros((n, 3, 3)),
         oriented=rng.random(n) < 0.3,
         modes=OrientationModes(np.zeros((n, 1)), np.tile(np.eye(3), (n, 1, 1, 1)), np.ones((n, 1))),
         symmetry=np.ones(n, np.int64),
