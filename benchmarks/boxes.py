@@ -4,8 +4,8 @@
 
 Prints one JSON object. ATE is after alignment, m; the oracle is told which box is of which object. Coverage is the share of
 landmarks whose true object lies within their own 90 % ellipsoid: in the frame of the first pose, where all landmarks of a drive
-share its drift, and in that of a camera that saw them; with the standard error of independent drives. `online` places boxes by what
-was seen before and solves keyframe by keyframe. With `--data`, fr2_desk of TUM RGB-D: boxes of a detector, the trajectory of
+share its drift, and in that of a camera that saw them; with the standard error of independent drives. `online` places boxes by
+what was seen before and solves keyframe by keyframe. With `--data`, fr2_desk of TUM RGB-D: boxes of a detector, the trajectory of
 ORB-SLAM with steps of an odometry's noise added to it, motion capture as truth.
 """
 
