@@ -9,7 +9,7 @@ from nolbo_ppl.data.converters.placed_boxes import observations_by_parallax
 from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_odometry, simulate_world
 from nolbo_ppl.data.simulated_boxes import BoxDetectorConfig, SimulatedBoxes, simulate_boxes
 from nolbo_ppl.errors import InputError
-from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, so3_exp, transform
+from nolbo_ppl.geometry.pose import chain, inverse, make_pose, relative, se3_exp, skew, so3_exp, transform
 from nolbo_ppl.inference.slam import SlamProblem, solve, solve_incremental
 from nolbo_ppl.inference.slam.boxes.box_placement import BoxPlacer, place_boxes
 from nolbo_ppl.inference.slam.boxes.box_triangulation import triangulate
@@ -165,14 +165,21 @@ def test_slam_of_boxes_alone(online: bool, drive: tuple[np.ndarray, np.ndarray, 
     assert 0.6 * seen < len(shown) < 1.3 * seen
     nearest = [np.linalg.norm(places - one.position, axis=1).min() for one in shown]
     assert np.median(nearest) < 1.0
-    # 90 % regions hold their object, three standard errors of so many granted; taken for independent views they held 0.3 to 0.6.
+    # 90 % regions in the camera that saw an object hold it, three standard errors of so many granted. (In the frame of the first
+    # pose all landmarks of a drive share its drift: one drive says nothing there, `benchmarks/boxes.py` pools twenty.)
     object_of, landmarks = boxes.object_of[[int(name[1:]) for name in table.id]], result.associations.landmark
     inside = []
     for one in shown:
-        votes = np.bincount(object_of[result.associations.row[landmarks == one.index]] + 1, minlength=2)
+        rows = result.associations.row[landmarks == one.index]
+        votes = np.bincount(object_of[rows] + 1, minlength=2)
         if votes.argmax():
-            gap = one.position - places[votes.argmax() - 1]
-            inside.append(gap @ np.linalg.solve(one.position_covariance, gap) < 6.251)
+            t = int(np.sort(table.frame[rows])[len(rows) // 2])
+            T, R = inverse(result.T_world_camera[t]), one.T_world_object[:3, :3]
+            local = transform(T, one.position)
+            gap = local - transform(inverse(truth[t]), places[votes.argmax() - 1])
+            joint = result.joint_covariance(np.array([t]), np.array([one.index])).reshape(12, 12)
+            H = np.concatenate([skew(local), -np.eye(3), np.zeros((3, 3)), T[:3, :3] @ R], axis=1)
+            inside.append(gap @ np.linalg.solve(H @ joint @ H.T, gap) < 6.251)
     assert np.mean(inside) > 0.9 - 3 * np.sqrt(0.09 / len(inside))
 
 
