@@ -53,7 +53,7 @@ def check_table(table: Detections, frames: int) -> None:
     refuse(bad, "position_tails are no law", table.position_tails, "degrees of freedom and a factor, above 0")
     shared = np.where(np.isnan(table.position_shared), 0.0, table.position_shared)
     stated = shared.any(axis=(1, 2))
-    refuse(~np.isfinite(shared).all(axis=(1, 2)), "shared position covariance is not finite", shared, "finite m^2")
+    refuse(np.asarray(~np.isfinite(shared).all(axis=(1, 2))), "shared position covariance is not finite", shared, "finite m^2")
     skewed = np.abs(shared - np.swapaxes(shared, 1, 2)).max(axis=(1, 2), initial=0) > 1e-6 * np.abs(shared).max(
         axis=(1, 2), initial=0
     )
