@@ -79,9 +79,13 @@ def main() -> int:
         if isinstance(report, str):
             answers.append(f"{service}: {report}")
             continue
+        audited = sum("skip_reason" not in package for package in report["dependencies"])
+        if not audited:  # a mirror of the index without advisories: that nothing is known there says nothing
+            answers.append(f"{service}: knows none of {len(requirements)} packages")
+            continue
         known, told = judge(report)
         sys.stdout.write("".join(line + "\n" for line in (*told, *known)))
-        sys.stdout.write(f"{len(requirements)} packages asked for at {service}: {len(known)} known vulnerabilities\n")
+        sys.stdout.write(f"{audited} of {len(requirements)} packages audited at {service}: {len(known)} known vulnerabilities\n")
         return int(bool(known))
     sys.stderr.write("audit: no advisory service answers, nothing was audited\n" + "".join(f"  {one}\n" for one in answers))
     return 3

@@ -100,7 +100,12 @@ def test_packages_of_an_environment_are_asked_for_without_local_versions(tmp_pat
     ("answers", "status", "said"),
     [
         (["no route", "no route"], 3, "nothing was audited"),
-        (["no route", {"dependencies": []}], 0, "asked for at osv: 0 known"),
+        (
+            ["no route", {"dependencies": [{"name": "a", "version": "1", "vulns": []}]}],
+            0,
+            "1 of 1 packages audited at osv: 0 known",
+        ),
+        ([{"dependencies": [{"name": "a", "skip_reason": "not there"}]}, "no route"], 3, "pypi: knows none of 1 packages"),
         ([{"dependencies": [{"name": "a", "version": "1", "vulns": [{"id": "X"}]}]}], 1, "a 1: X, mended in no version"),
     ],
 )
