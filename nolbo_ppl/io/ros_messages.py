@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import islice
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -155,8 +156,9 @@ def read_camera_info(path: str | PathLike[str], image: str | None = None) -> tup
             if name is None:
                 return None
         topic = bag.topic(name, CAMERAS, "camera info")
-        _, message = next(bag.messages(topic.name))
-        return camera_document(message, "rect" in (image or ""), file), topic.name
+        for _, message in islice(bag.messages(topic.name), 1):
+            return camera_document(message, "rect" in (image or ""), file), topic.name
+    raise input_error(f"topic {topic.name} has no messages", expected="camera info", file=file)
 
 
 def pose_of(message: Any) -> Float[np.ndarray, "4 4"]:
@@ -218,8 +220,8 @@ def camera_frames(bag: Bag) -> set[str]:
     """Names of the frames of the cameras in a bag."""
     names = set()
     for topic in bag.of_types((*CAMERAS, *IMAGES)):
-        _, message = next(bag.messages(topic.name))
-        names.add(message.header.frame_id.strip("/"))
+        for _, message in islice(bag.messages(topic.name), 1):  # a topic may be announced and never used
+            names.add(message.header.frame_id.strip("/"))
     return names - {""}
 
 
@@ -255,6 +257,8 @@ def read_bag_poses(
             poses.append(pose_of(message))
             times.append(time)
             body = getattr(message, "child_frame_id", "")
+        if not poses:
+            raise input_error(f"topic {topic.name} has no messages", expected="poses", file=file)
         T_body_camera = mounting(bag, body) if body else np.eye(4)
     if T_body_camera is None:
         raise input_error(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nolbo_ppl.data.converters.ros_detections import read_bag_detections
 from nolbo_ppl.data.sequences import BagFrames, frames_with_camera, open_frames
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import make_pose, so3_exp
@@ -170,3 +171,26 @@ def test_names_of_topics(tmp_path: Path) -> None:
     assert not is_bag(tmp_path) and not is_bag("poses.txt")
     (tmp_path / "metadata.yaml").write_text("")
     assert is_bag(f"{tmp_path}:/odom")
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_topics_without_messages_are_no_surprise(tmp_path: Path, kind: str) -> None:
+    """Announced and never used: told where they are asked for, passed over where they are not."""
+    path, used = path_of(tmp_path, kind), tmp_path / "used"
+    types = {
+        "/odom": "nav_msgs/msg/Odometry",
+        "/cam/info": "sensor_msgs/msg/CameraInfo",
+        "/found": "vision_msgs/msg/Detection3DArray",
+    }
+    with BagWriter(path, kind) as bag:
+        bag.image("/cam/image", 1.0, colours(0), "rgb8")
+        for topic, name in types.items():
+            bag.connections[topic] = bag.writer.add_connection(topic, name, typestore=bag.store)
+    for read, topic in zip((read_trajectory, read_camera, read_bag_detections), types):
+        with pytest.raises(InputError, match=rf"topic {topic} has no messages"):
+            read(Path(f"{path}:{topic}"))
+    used.mkdir()
+    with BagWriter(path_of(used, kind), kind) as bag:
+        bag.connections["/cam/info"] = bag.writer.add_connection("/cam/info", types["/cam/info"], typestore=bag.store)
+        bag.odometry("/odom", 1.0, np.eye(4), "camera")
+    assert len(read_trajectory(path_of(used, kind)).T_world_camera) == 1

@@ -112,6 +112,8 @@ def read_bag_detections(path: str | PathLike[str]) -> BagDetections:
                 placed = (R @ position + T[:3, 3], R @ covariance @ R.T, R @ rotation, size)
                 rows.append((len(times), _box(detection), certainty, category, *placed))
             times.append(time)
+    if not times:
+        raise input_error(f"topic {topic.name} has no messages", expected="detections", file=file)
 
     def column(k: int, *shape: int) -> np.ndarray:
         return np.array([row[k] for row in rows], dtype=np.float64).reshape(-1, *shape)
