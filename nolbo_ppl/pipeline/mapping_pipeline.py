@@ -67,8 +67,6 @@ class ObjectMappingPipeline:
         config, known = self.config.slam, self.model.calibration
         if config.latent_correlation is None:
             config = dataclasses.replace(config, latent_correlation=known.shape_correlation)
-        if config.position_tails is None and known.position_tails is not None:
-            config = dataclasses.replace(config, position_tails=(known.position_dof, known.position_spread))
         return config
 
     def read(self, k: int) -> np.ndarray:

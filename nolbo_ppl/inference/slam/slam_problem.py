@@ -97,8 +97,11 @@ class SlamConfig:
     """Its growth with range, m per m."""
     position_tails: tuple[float, float] | None = None
     """Student's t in place of Gaussians for observed positions: degrees of freedom, and the factor on their stated covariances
-    that makes them its scale matrices. None: what the detections state, in a run from images what the model's calibration found;
-    Gaussian where nobody states it."""
+    that makes them its scale matrices. None: Gaussian, or what `stated_tails` asks for."""
+    stated_tails: bool = False
+    """Take the law that detections state for their positions (`Detections.position_tails`; what a model's calibration found).
+    It is that of single detections, in its bulk narrower than their covariances; views of one object err together, and on the
+    drive of `nolbo demo` the error after SLAM was 0.124 m with it, 0.100 m without (no other drive was measured)."""
     rotation_scale: float | None = None
     """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
     latent_scale: float | None = None

@@ -51,15 +51,16 @@ def test_what_is_no_law_is_refused(tmp_path: Path, value: object) -> None:
 
 
 def test_slam_takes_what_detections_state() -> None:
-    """As if the configuration had said it; what the configuration says comes first; without either positions are Gaussian."""
-    stated = estimate_noise(problem(table()), SlamConfig())
+    """As if the configuration had said it, where it is asked to; what it says itself comes first; else positions are Gaussian."""
+    stated = estimate_noise(problem(table()), SlamConfig(stated_tails=True))
+    assert estimate_noise(problem(table()), SlamConfig()).position_dof is None
     told = estimate_noise(problem(table(tails=None)), SlamConfig(position_tails=(3.0, 0.5)))
     assert stated.position_dof == told.position_dof == 3.0
     np.testing.assert_array_equal(stated.position_covariance, told.position_covariance)
-    other = estimate_noise(problem(table()), SlamConfig(position_tails=(5.0, 0.25)))
+    other = estimate_noise(problem(table()), SlamConfig(position_tails=(5.0, 0.25), stated_tails=True))
     assert other.position_dof == 5.0
     np.testing.assert_allclose(2 * other.position_covariance, stated.position_covariance)
-    plain = estimate_noise(problem(table(tails=None)), SlamConfig())
+    plain = estimate_noise(problem(table(tails=None)), SlamConfig(stated_tails=True))
     assert plain.position_dof is None
     np.testing.assert_allclose(0.5 * plain.position_covariance, stated.position_covariance)
 
@@ -68,7 +69,7 @@ def test_detections_of_two_sources() -> None:
     """Factors are each row's own; one that states none keeps its covariance."""
     seen = table()
     tails = np.array([[2.5, 0.4], [2.5, 0.4], [2.5, 0.4], [4.0, 0.8], [np.nan, np.nan], [np.nan, np.nan]])
-    mixed = estimate_noise(problem(dataclasses.replace(seen, position_tails=tails)), SlamConfig())
+    mixed = estimate_noise(problem(dataclasses.replace(seen, position_tails=tails)), SlamConfig(stated_tails=True))
     plain = estimate_noise(problem(table(tails=None)), SlamConfig())
     assert mixed.position_dof == 2.5
     factor = mixed.position_covariance[:, 0, 0] / plain.position_covariance[:, 0, 0]

@@ -106,13 +106,14 @@ def estimate_noise(problem: SlamProblem, config: SlamConfig) -> NoiseModel:
 def position_law(table: Detections, config: SlamConfig) -> tuple[float | None, Float[np.ndarray, " n"]]:
     """Degrees of freedom of all positions (None: Gaussian), and the factor that makes each stated covariance a scale matrix.
 
-    The configuration's, else what the detections state: the median of their degrees of freedom, each its own factor.
+    The configuration's, else what the detections state, where it is asked for: the median of their degrees of freedom, each its
+    own factor.
     """
     stated = np.isfinite(table.position_covariance).all(axis=(1, 2))
     if config.position_tails is not None:
         return config.position_tails[0], np.where(stated, config.position_tails[1], 1.0)
     told = np.isfinite(table.position_tails).all(axis=1)
-    if not told.any():
+    if not (config.stated_tails and told.any()):
         return None, np.ones(len(table))
     return float(np.median(table.position_tails[told, 0])), np.where(stated & told, table.position_tails[:, 1], 1.0)
 
