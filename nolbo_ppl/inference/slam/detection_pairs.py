@@ -60,7 +60,7 @@ class DetectionPairs:
 def detection_pairs(state: SlamState, linearisation: Linearisation, rng: np.random.Generator) -> DetectionPairs:
     """All pairs inside the gate, with their log densities."""
     seen, estimate = state.measurements, state.estimate
-    pose_delta, landmark_delta = linearisation.samples(min(state.config.samples, 48), rng)
+    pose_delta, landmark_delta = linearisation.samples(linearisation.affordable(min(state.config.samples, 48)), rng)
     row, landmark = _near(state)
     member = _member_weights(state, row, landmark)
     out: list[tuple[np.ndarray, ...]] = []

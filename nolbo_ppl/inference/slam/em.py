@@ -148,7 +148,7 @@ def step(state: SlamState) -> tuple[SlamState, EmStepInfo]:
     linearisation = linearise(linked, state.estimate)
     if state.iteration and state.iteration % 2 == 0:
         state = refine_odometry(state, linearisation)
-    samples = posterior_samples(linearisation, state.estimate, config.samples, rng)
+    samples = posterior_samples(linearisation, state.estimate, linearisation.affordable(config.samples), rng)
     inflation = config.annealing[min(state.iteration, len(config.annealing) - 1)]
     pairs = candidate_pairs(
         state.estimate,

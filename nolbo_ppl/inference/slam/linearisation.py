@@ -13,6 +13,9 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.graph import GraphError, SlamEstimate, named_error, to_values
 
+SAMPLED_BLOCKS, LARGEST_SAMPLE = 50_000, 4
+"""Samples of a small graph: as many as make so many poses and landmarks, at most this multiple of the configured number."""
+
 
 @dataclass(frozen=True)
 class Linearisation:
@@ -44,6 +47,10 @@ class Linearisation:
         if self.error_root is None:
             return rng.standard_normal((self.jacobian.shape[0], count))
         return np.asarray(self.error_root @ rng.standard_normal((self.error_root.shape[1], count)))
+
+    def affordable(self, count: int) -> int:
+        """Number of samples, `count` or more where the graph is small: there a map must not depend on which were drawn."""
+        return max(count, min(LARGEST_SAMPLE * count, SAMPLED_BLOCKS // (self.landmarks + self.poses)))
 
     def samples(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 6 s"], Float[np.ndarray, "m 6 s"]]:
         """Posterior samples in the tangent spaces of poses and landmarks: solve J'J d = J' e for e of N(0, I)."""

@@ -100,7 +100,8 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
 
     Two objects in view would each have been missed wherever the other was detected; one was not.
     """
-    samples = posterior_samples(linearise_state(state), state.estimate, state.config.samples, rng)
+    linearisation = linearise_state(state)
+    samples = posterior_samples(linearisation, state.estimate, linearisation.affordable(state.config.samples), rng)
     frames = frames_of_landmarks(state)
     spans = replace(state.features, first=np.arange(len(frames)), last=np.arange(len(frames)))  # every pair once
     pairs = candidate_pairs(state.estimate, samples, spans, state.prior, state.config, inflation=1.0, floor=state.link_scale)

@@ -128,9 +128,8 @@ def residual_ratios(state: SlamState, linearisation: Linearisation) -> tuple[tup
     """
     rng = np.random.default_rng(state.config.seed + 7919)
     end = 6 * len(state.problem)
-    expected = linearisation.residual_samples(min(state.config.samples, 24), rng)[6:end].reshape(
-        -1, 6, min(state.config.samples, 24)
-    )
+    count = linearisation.affordable(min(state.config.samples, 24))
+    expected = linearisation.residual_samples(count, rng)[6:end].reshape(-1, 6, count)
     residual = linearisation.residual[6:end].reshape(-1, 6)
     out = []
     for part in (slice(3), slice(3, 6)):
