@@ -30,7 +30,7 @@ from nolbo_ppl.viz.posterior_plots import draw_observations
 MOTORCYCLE = (994.978, 994.978, 311.193, 254.877)
 """fx fy cx cy of the left camera, px (scikit-image, `stereo_motorcycle`)."""
 
-DESK = "1305031453.359684.jpg"
+DESK = "1305031468.395860.jpg"
 """Frame of the desk that is drawn."""
 FR1 = CameraIntrinsics(517.3, 516.5, 318.6, 255.3, 640, 480, "radial-tangential", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 """Camera of freiburg1."""
