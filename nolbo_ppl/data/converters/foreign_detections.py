@@ -118,7 +118,7 @@ def _coco(path: Path, names: Mapping[int, str] | None) -> list[_Row]:
     if isinstance(content, dict):
         images = {image["id"]: str(image["file_name"]) for image in content.get("images", [])}
         names = {int(c["id"]): str(c["name"]) for c in content.get("categories", [])} or names
-        content = content.get("annotations", [])
+        content = content["annotations"]
     rows = []
     for k, item in enumerate(content):
         if item.get("iscrowd"):

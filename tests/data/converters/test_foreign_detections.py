@@ -168,6 +168,7 @@ def test_the_command_writes_observations(tmp_path: Path, capsys: pytest.CaptureF
         ("coco", '[{"image_id": 1, "category_id": 12, "bbox": [0, 0, 1, 1]}]', "category without a name: got 12"),
         ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [0, 0, 0, 1]}]', "box 0: got .*expected x0 < x1"),
         ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [0, 0, 1, 1], "score": 3}]', "score: got 3.0"),
+        ("coco", '{"images": [], "model": 1}', "not detections in the format coco: got KeyError: 'annotations'"),
         ("coco", '[{"image_id": 1}]', "not detections in the format coco: got KeyError"),
         ("coco", '[{"image_id": 1, "category_id": 1, "bbox": [true, 0, 1, 1]}]', "bbox of detection 0: got .*expected 4 numbers"),
         ("coco", '[{"image_id": 1, "category_id": 1, "bbox": ["0", "0", "1", "1"]}]', "bbox of detection 0"),
