@@ -7,6 +7,7 @@ import json
 import tempfile
 import zipfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -210,8 +211,11 @@ def stream_surfaces() -> list[Surface]:
     def topic(path: Path) -> Any:
         return read_trajectory(Path(f"{path}:/pose"))
 
+    found = [Surface("a.avi", written(video, "a.avi"), frames)]
+    if find_spec("rosbags") is None:  # the extra `ros`
+        return found
     return [
-        Surface("a.avi", written(video, "a.avi"), frames),
+        *found,
         Surface("a.bag", written(lambda p: poses(p, True), "a.bag"), topic),
         Surface("a.mcap", written(lambda p: poses(p, False), "a.mcap"), topic),
     ]
