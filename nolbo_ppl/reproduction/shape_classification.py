@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -54,10 +53,6 @@ class ShapeVaeConfig:
     """Shapes decoded a step, which stand for all: the decoder costs four times what the encoder does."""
     learning_rate: float = 2e-3
     """Rate after the warm-up; it falls along a cosine over the second half."""
-    optimizer: Literal["adamw", "muon"] = "adamw"
-    """AdamW, or Muon on hidden kernels and matrices."""
-    weights: dict[str, float] = field(default_factory=dict)
-    """Weights of single terms in place of those of the stage of shapes."""
     shift: int = 1
     """Shapes are moved by up to so many voxels along every axis."""
     half_precision: bool = True
@@ -129,11 +124,8 @@ def fit_shape_vae(
         adopt_features(model, load(config.initial, "cpu").model, SHAPE_FEATURES)
     where = device_of(device)
     model = model.to(where, torch.get_default_dtype())
-    schedule = OptimizerConfig(
-        config.steps, config.learning_rate, warmup=min(50, config.steps), clip=5000.0, ema=0.99, optimizer=config.optimizer
-    )
-    weights = {**SHAPE_STAGE, **config.weights}
-    run = StageRun(model, TrainingStage("shapes", schedule, weights, decode=config.decode), config.half_precision)
+    schedule = OptimizerConfig(config.steps, config.learning_rate, warmup=min(50, config.steps), clip=5000.0, ema=0.99)
+    run = StageRun(model, TrainingStage("shapes", schedule, SHAPE_STAGE, decode=config.decode), config.half_precision)
     identity = {**dataclasses.asdict(config), "shapes": len(archive)}
     identity = {name: list(v) if isinstance(v, tuple) else v for name, v in identity.items() if name != "checkpoint_every"}
     if checkpoint is not None and checkpoint.is_file():
