@@ -25,6 +25,7 @@ def scored(log_odds: np.ndarray, rng: np.random.Generator) -> Measurements:
         frame=np.arange(n) % 20,
         position=np.array([0.0, 0.0, 8.0]) + rng.standard_normal((n, 3)),
         covariance=np.tile(0.01 * np.eye(3), (n, 1, 1)),
+        shared_root=np.zeros((n, 3, 3)),
         oriented=np.zeros(n, bool),
         modes=OrientationModes(np.zeros((n, 1)), np.tile(np.eye(3), (n, 1, 1, 1)), np.ones((n, 1))),
         symmetry=np.ones(n, np.int64),

@@ -24,6 +24,7 @@ def detections(position: np.ndarray, covariance: np.ndarray, log_odds: float = 2
         frame=np.zeros(n, np.int64),
         position=position,
         covariance=covariance,
+        shared_root=np.zeros((n, 3, 3)),
         oriented=np.zeros(n, bool),
         modes=OrientationModes(np.zeros((n, 1)), np.tile(np.eye(3), (n, 1, 1, 1)), np.ones((n, 1))),
         symmetry=np.ones(n, np.int64),
