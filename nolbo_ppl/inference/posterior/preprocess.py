@@ -21,7 +21,7 @@ PADDING = 114
 """Grey value of the bars beside an image."""
 DETAIL = (1.15, 2.0)
 """Objects are cut out of an image this many times larger than the network sees it whole: where there is less to be gained it is
-not kept, and no more for the sake of memory. (On cars of photographs seen at 208 px: docs/results.md.)"""
+not kept, and no more for the sake of memory. What it gains has not been measured."""
 DETAIL_PIXELS = 1 << 23
 """Pixels of the larger images of a batch (130 MB of normalised colours at all sizes), or one image."""
 MIN_SIDE = 8
