@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl.inference.slam.latent_mixture import LARGE_VARIANCE as LARGE_VARIANCE
+from nolbo_ppl.inference.slam.latent_mixture import LatentMixture, pair_log_density
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 from nolbo_ppl.io.observations import Detections
-
-LARGE_VARIANCE = 1e12
-"""Variance that stands for a missing latent: it carries no weight."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,24 @@ class FeaturePrior:
         latent_b: np.ndarray,
         variance_b: np.ndarray,
         category_b: np.ndarray,
+        modes_a: LatentMixture | None = None,
+        modes_b: LatentMixture | None = None,
     ) -> Float[np.ndarray, " p"]:
         """Log ratio of a's features given b to those of any object, nats.
 
-        With latents at hand an equal category adds nothing (it is read off the same latent), a different one counts.
+        With latents at hand an equal category adds nothing (it is read off the same latent), a different one counts; where modes
+        are stated it does not: their weights say how sure the category is.
         """
         category = self.category_log_ratio(category_b, category_a)
         if not latent_a.shape[1]:
             return category
         known = (variance_a[:, 0] < LARGE_VARIANCE) & (variance_b[:, 0] < LARGE_VARIANCE)
+        if modes_a is not None or modes_b is not None:
+            a, b = modes_a or LatentMixture.of_one(latent_a), modes_b or LatentMixture.of_one(latent_b)
+            category = np.where(known & (a.several | b.several), 0.0, category)
+            population = LatentMixture.of_one(np.broadcast_to(self.mean, latent_a.shape))
+            latent = pair_log_density(a, b, variance_a + variance_b) - pair_log_density(a, population, variance_a + self.variance)
+            return np.where(known, latent + np.minimum(category, 0.0), category)
         latent = latent_log_density(latent_a, latent_b, variance_a + variance_b) - latent_log_density(
             latent_a, self.mean, variance_a + self.variance
         )

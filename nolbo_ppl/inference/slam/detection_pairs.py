@@ -10,12 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, skew, transform
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, weighted_latents
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import inflated
+from nolbo_ppl.inference.slam.latent_mixture import resolved_latents
 from nolbo_ppl.inference.slam.linearisation import Linearisation
 from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
@@ -105,16 +106,22 @@ def _near(state: SlamState) -> tuple[np.ndarray, np.ndarray]:
     return near_pairs(world, reach**2, position, np.zeros(len(position)))
 
 
-def _member_weights(state: SlamState, row: np.ndarray, landmark: np.ndarray) -> Float[np.ndarray, " p"]:
-    """Weight with which each pair is in the graph."""
+def _placed(state: SlamState, row: np.ndarray, landmark: np.ndarray) -> tuple[Int[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
+    """Place of each pair among those in the graph, and whether it is there at all."""
     m = max(len(state.estimate.T_world_landmark), 1)
     placed = state.rows.astype(np.int64) * m + state.landmark
     order = np.argsort(placed, kind="stable")
     asked = row.astype(np.int64) * m + landmark
     at = np.minimum(np.searchsorted(placed[order], asked), max(len(placed) - 1, 0))
     if not len(placed):
-        return np.zeros(len(row))
-    return np.where(placed[order][at] == asked, state.weight[order][at], 0.0)
+        return at, np.zeros(len(row), dtype=bool)
+    return order[at], placed[order][at] == asked
+
+
+def _member_weights(state: SlamState, row: np.ndarray, landmark: np.ndarray) -> Float[np.ndarray, " p"]:
+    """Weight with which each pair is in the graph."""
+    place, there = _placed(state, row, landmark)
+    return np.where(there, state.weight[place], 0.0) if there.any() else np.zeros(len(row))
 
 
 def _exact_rows(state: SlamState, member: np.ndarray, landmark: np.ndarray) -> np.ndarray:
@@ -197,17 +204,25 @@ def feature_log_ratio(
         mean, variance = mean.copy(), variance.copy()
         k, j = row[own], landmark[own]
         inside = seen.select(state.rows)
-        raw, raw_variance = weighted_latents(inside.latent, inside.latent_variance, state.landmark, state.weight, m)
+        taken = resolved_latents(inside.latent, inside.latent_variance, inside.latent_modes, state.landmark, state.weight)
+        raw, raw_variance = weighted_latents(taken, inside.latent_variance, state.landmark, state.weight, m)
+        mine = seen.latent[k] if seen.latent_modes is None else taken[_placed(state, k, j)[0]]
         known = seen.latent_variance[k] < LARGE_VARIANCE
         precision = 1.0 / raw_variance[j] - np.where(known, member[own, None] / seen.latent_variance[k], 0.0)
         some = precision > 1e-6 / raw_variance[j]
-        total = raw[j] / raw_variance[j] - np.where(known, member[own, None] * seen.latent[k] / seen.latent_variance[k], 0.0)
+        total = raw[j] / raw_variance[j] - np.where(known, member[own, None] * mine / seen.latent_variance[k], 0.0)
         # Views that are alike widen a mean of n by 1 + r (n - 1).
         views = np.maximum(variance[own] / raw_variance[j] - (config.latent_correlation or 0.0) * known, 1.0)
         mean[own] = np.where(some, total / np.where(some, precision, 1.0), mean[own])
         variance[own] = np.where(some, views / np.where(some, precision, 1.0), LARGE_VARIANCE)
     value = state.prior.log_likelihood_ratio(
-        seen.latent[row], seen.latent_variance[row], seen.category[row], mean, variance, features.category[landmark]
+        seen.latent[row],
+        seen.latent_variance[row],
+        seen.category[row],
+        mean,
+        variance,
+        features.category[landmark],
+        None if seen.latent_modes is None else seen.latent_modes.select(row),
     )
     both = np.flatnonzero(seen.oriented[row] & features.oriented[landmark])
     if len(both):

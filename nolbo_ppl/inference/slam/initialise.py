@@ -18,6 +18,7 @@ from nolbo_ppl.inference.slam.detection_features import (
 )
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate, add_landmark_equalities, optimize
+from nolbo_ppl.inference.slam.latent_mixture import chosen_modes
 from nolbo_ppl.inference.slam.linearisation import Linearisation, linearise
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
@@ -98,7 +99,12 @@ def tracklet_features(
     """Latent posterior, category, symmetry and life span of each landmark from its detections."""
     seen = measurements.select(rows)
     category = seen.category
-    mean, spread = weighted_latents(seen.latent, seen.latent_variance, landmark, weight, landmarks)
+    latent = seen.latent
+    if seen.latent_modes is not None:
+        chosen = chosen_modes(seen.latent_modes, seen.latent_variance, landmark, weight)
+        latent = seen.latent_modes.mean[np.arange(len(rows)), chosen]
+        category = np.where(chosen == seen.latent_modes.heaviest, category, -1)  # what it names goes with the heaviest mode
+    mean, spread = weighted_latents(latent, seen.latent_variance, landmark, weight, landmarks)
     known = (seen.latent_variance < LARGE_VARIANCE).all(axis=1) if mean.shape[1] else np.zeros(len(rows), bool)
     views = np.bincount(landmark, weights=weight * known, minlength=landmarks)
     spread = correlated_variance(spread, views, config.latent_correlation or 0.0)

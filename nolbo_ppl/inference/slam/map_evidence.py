@@ -17,6 +17,7 @@ from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_lat
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import odometry_rows
 from nolbo_ppl.inference.slam.initialise import base_graph
+from nolbo_ppl.inference.slam.latent_mixture import chosen_modes
 from nolbo_ppl.inference.slam.linearisation import Linearisation, linearise
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, mixture_log_density
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -77,15 +78,23 @@ def detection_log_odds(state: SlamState) -> Float[np.ndarray, " k"]:
 
 def feature_log_evidence(state: SlamState) -> float:
     """Latents and categories of each landmark's tracks, one after the other, against any object's, nats."""
-    prior, seen = state.prior, state.measurements
+    prior, seen = state.prior, state.measurements.select(state.rows)
     track = state.tracklets.of_observation[state.rows]
     latent, variance, category = seen.latent, seen.latent_variance, seen.category
+    doubt = np.zeros(len(latent))
+    if seen.latent_modes is not None:
+        # A detection takes its mode in the landmark, at the price of that mode against the one of its track alone.
+        row = np.arange(len(latent))
+        chosen, alone = (chosen_modes(seen.latent_modes, variance, of, state.weight) for of in (state.landmark, track))
+        latent = seen.latent_modes.mean[row, chosen]
+        doubt = np.minimum(seen.latent_modes.log_weight[row, chosen] - seen.latent_modes.log_weight[row, alone], 0.0)
+        category = np.where(chosen == seen.latent_modes.heaviest, category, -1)  # what it names goes with the heaviest mode
     members: dict[int, dict[int, list[int]]] = {}
-    for row, j, t, weight in zip(state.rows.tolist(), state.landmark.tolist(), track.tolist(), state.weight.tolist()):
+    for place, (j, t, weight) in enumerate(zip(state.landmark.tolist(), track.tolist(), state.weight.tolist())):
         if weight <= 0.5:
             continue
-        members.setdefault(j, {}).setdefault(t, []).append(row)
-    value = 0.0
+        members.setdefault(j, {}).setdefault(t, []).append(place)
+    value = float(doubt[state.weight > 0.5].sum())
     correlation = state.config.latent_correlation or 0.0
     for tracks in members.values():
         mean = spread = None

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from nolbo_ppl.geometry.pose import transform
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, detection_features
 from nolbo_ppl.inference.slam.gaussian import upper_root
+from nolbo_ppl.inference.slam.latent_mixture import LatentMixture, observed_latent_modes
 from nolbo_ppl.inference.slam.orientation import OrientationModes, observed_modes, resolved_symmetry
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 from nolbo_ppl.structures.detections import Detections
@@ -49,6 +50,8 @@ class Measurements:
     """Log likelihood of the score for a true object, `log q / pi` (docs/em.md)."""
     log_clutter: Float[np.ndarray, " n"]
     """The same for a false detection, `log (1 - q) / (1 - pi)`."""
+    latent_modes: LatentMixture | None = None
+    """Modes of the latents; None where no detection states two."""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -56,7 +59,8 @@ class Measurements:
     def select(self, rows: np.ndarray) -> Measurements:
         """Some of the rows."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        taken: dict[str, Any] = {k: v.select(rows) if k == "modes" else v[rows] for k, v in values.items()}
+        parted = ("modes", "latent_modes")
+        taken: dict[str, Any] = {k: v.select(rows) if k in parted else v[rows] for k, v in values.items() if v is not None}
         return Measurements(**taken)
 
     def in_world(self, T_world_camera: Float[np.ndarray, "n 4 4"]) -> Measurements:
@@ -96,4 +100,5 @@ def resolve(table: Detections, noise: NoiseModel, config: SlamConfig, prior: Fea
         category=category,
         log_object=np.log(objectness / share),
         log_clutter=np.log((1 - objectness) / (1 - share)),
+        latent_modes=observed_latent_modes(table, latent),
     )

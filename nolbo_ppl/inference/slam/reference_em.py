@@ -33,6 +33,7 @@ from nolbo_ppl.inference.slam.graph import (
     pose_key,
     to_values,
 )
+from nolbo_ppl.inference.slam.latent_mixture import LatentMixture
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.inference.slam.orientation import (
@@ -220,13 +221,27 @@ def e_step(state: ReferenceEmState) -> tuple[Float[np.ndarray, "g m"], Float[np.
         known = seen.latent_variance[:, 0] < LARGE_VARIANCE
         latent, variance = seen.latent[known], seen.latent_variance[known]
         population = latent_log_density(latent, state.prior.mean, variance + state.prior.variance)
-        log_likelihood[known] += latent_log_density(latent[:, None], state.latent[None], variance[:, None]) - population[:, None]
+        if seen.latent_modes is None:
+            density = latent_log_density(latent[:, None], state.latent[None], variance[:, None])
+        else:
+            by_latent, population = _latents_by_mode(state, seen.latent_modes)
+            density, population = np.logaddexp.reduce(by_latent[known], axis=1), population[known]
+        log_likelihood[known] += density - population[:, None]
     log_null = np.logaddexp(seen.log_object + np.log(noise.birth_intensity), seen.log_clutter + np.log(noise.clutter_intensity))
     k, j = np.nonzero(np.isfinite(log_likelihood))
     found = frame_marginals(seen.frame, k, j, log_likelihood[k, j], log_null, associator=config.associator)
     weights = np.zeros((n, m))
     weights[k, j] = found.weight
     return weights[state.modes.row] * share, weights, float(found.log_evidence.sum())
+
+
+def _latents_by_mode(state: ReferenceEmState, modes: LatentMixture) -> tuple[Float[np.ndarray, "k L m"], Float[np.ndarray, " k"]]:
+    """Log density of every mode of every latent given every landmark's, weight included, and of all in the population."""
+    variance = state.measurements.latent_variance[:, None]
+    by_mode = [latent_log_density(modes.mean, landmark, variance) for landmark in state.latent]
+    of_any = latent_log_density(modes.mean, state.prior.mean, variance + state.prior.variance)
+    population = np.logaddexp.reduce(modes.log_weight + of_any, axis=1)
+    return modes.log_weight[..., None] + np.stack(by_mode, axis=-1), population
 
 
 def position_factor(
@@ -286,6 +301,11 @@ def em_step(state: ReferenceEmState) -> tuple[ReferenceEmState, ReferenceEmInfo]
         known = variance[:, 0] < LARGE_VARIANCE
         precision = np.einsum("km,kd->md", weights[known], 1.0 / variance[known])
         total = np.einsum("km,kd->md", weights[known], value[known] / variance[known])
+        if state.measurements.latent_modes is not None:  # each mode by its share, as those of orientations
+            modes = state.measurements.latent_modes
+            by_latent, _ = _latents_by_mode(state, modes)
+            share = np.exp(by_latent - np.logaddexp.reduce(by_latent, axis=1, keepdims=True)) * weights[:, None]
+            total = np.einsum("klm,kld->md", share[known], modes.mean[known] / variance[known, None])
         latent = np.where(precision > 1e-9, total / np.maximum(precision, 1e-9), state.latent)
     return replace(state, estimate=estimate, latent=latent, iteration=state.iteration + 1), info
 

@@ -16,6 +16,7 @@ from nolbo_ppl.geometry.pose import transform
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, fuse_latent
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.gaussian import squared_distance
+from nolbo_ppl.inference.slam.latent_mixture import LARGE_VARIANCE, LatentMixture
 from nolbo_ppl.inference.slam.measurements import Measurements, resolve
 from nolbo_ppl.inference.slam.near_pairs import near_pairs
 from nolbo_ppl.inference.slam.orientation import UNIFORM_LOG_DENSITY, OrientationModes, mixture_log_density
@@ -65,6 +66,7 @@ class Tracker:
         self.oriented = np.zeros(0, dtype=bool)
         self.latent = np.zeros((0, dimension))
         self.latent_variance = np.zeros((0, dimension))
+        self.latent_modes: LatentMixture | None = None
         self.category = np.zeros(0, dtype=np.int64)
         self.total = 0
 
@@ -83,22 +85,26 @@ class Tracker:
         for name in ("index", "mean", "covariance", "last", "oriented", "latent", "latent_variance", "category"):
             setattr(self, name, getattr(self, name)[rows])
         self.modes = self.modes.select(rows)
+        if self.latent_modes is not None:
+            self.latent_modes = self.latent_modes.select(rows)
 
     def associate(self, measurements: Measurements, frame: int) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Assign one frame's detections (in the world frame) to tracks and found new ones; track and marginal, -1: background."""
         seen, n = measurements, len(measurements)
         count = max(seen.modes.log_weight.shape[1], self.modes.log_weight.shape[1])
         modes, self.modes = seen.modes.padded(count), self.modes.padded(count)
+        latents = self._room_for(seen)
         log_new = seen.log_object + np.log(self.birth_intensity)
         log_clutter = seen.log_clutter + np.log(self.clutter_intensity)
-        k, j, value = self._log_odds(seen, modes)
+        k, j, value = self._log_odds(seen, modes, latents)
         found_pairs = frame_marginals(
             np.zeros(n, dtype=np.int64), k, j, value, np.logaddexp(log_new, log_clutter), associator=self.config.associator
         )
         assigned, weight = np.full(n, -1, dtype=np.int64), found_pairs.null.copy()
         for p in np.flatnonzero(found_pairs.weight > 0.5):
             i, track = int(k[p]), int(j[p])
-            self._update(track, seen.position[i], seen.covariance[i], seen.latent[i], seen.latent_variance[i], frame)
+            self._update(track, seen.position[i], seen.covariance[i], frame)
+            self._update_latent(track, seen.latent[i], seen.latent_variance[i], latents, i)
             if seen.oriented[i]:
                 self._orient(track, modes.select(np.array([i])), seen.symmetry[[i]])
             assigned[i], weight[i] = self.index[track], found_pairs.weight[p]
@@ -108,7 +114,19 @@ class Tracker:
             assigned[rows] = self._found(seen, modes, rows, frame)
         return assigned, weight
 
-    def _log_odds(self, seen: Measurements, modes: OrientationModes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _room_for(self, seen: Measurements) -> LatentMixture | None:
+        """Modes of the detections' latents, padded as those of the tracks; None where neither has any."""
+        if self.latent_modes is None and seen.latent_modes is None:
+            return None
+        own, latents = self.latent_modes or LatentMixture.of_one(self.latent), seen.latent_modes
+        latents = latents or LatentMixture.of_one(seen.latent)
+        count = max(own.log_weight.shape[1], latents.log_weight.shape[1])
+        self.latent_modes = own.padded(count)
+        return latents.padded(count)
+
+    def _log_odds(
+        self, seen: Measurements, modes: OrientationModes, latents: LatentMixture | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of detections and tracks inside the gate and their log odds: density over that of any object, per m^3."""
         seen_reach, track_reach = (GATE * np.trace(S, axis1=1, axis2=2) for S in (seen.covariance, self.covariance))
         k, j = near_pairs(seen.position, seen_reach, self.mean, track_reach)
@@ -126,6 +144,8 @@ class Tracker:
             self.latent[j],
             self.latent_variance[j],
             self.category[j],
+            None if latents is None else latents.select(k),
+            None if self.latent_modes is None else self.latent_modes.select(j),
         )
         return k, j, value
 
@@ -141,20 +161,38 @@ class Tracker:
         self.modes = OrientationModes(
             *(np.concatenate([getattr(self.modes, name), getattr(modes, name)[rows]]) for name in ("log_weight", "R", "scale"))
         )
+        if self.latent_modes is not None:
+            more = (seen.latent_modes or LatentMixture.of_one(seen.latent)).select(rows)
+            self.latent_modes = self.latent_modes.stacked(more)
         self.latent = np.concatenate([self.latent, seen.latent[rows]])
         self.latent_variance = np.concatenate([self.latent_variance, seen.latent_variance[rows]])
         self.category = np.concatenate([self.category, seen.category[rows]])
         return new
 
-    def _update(
-        self, j: int, position: np.ndarray, covariance: np.ndarray, latent: np.ndarray, latent_variance: np.ndarray, frame: int
-    ) -> None:
+    def _update(self, j: int, position: np.ndarray, covariance: np.ndarray, frame: int) -> None:
         gain = np.linalg.solve(self.covariance[j] + covariance, self.covariance[j]).T
         self.mean[j] += gain @ (position - self.mean[j])
         self.covariance[j] = self.covariance[j] - gain @ self.covariance[j]
         self.covariance[j] = 0.5 * (self.covariance[j] + self.covariance[j].T)
-        self.latent[j], self.latent_variance[j] = fuse_latent(self.latent[j], self.latent_variance[j], latent, latent_variance)
         self.last[j] = frame
+
+    def _update_latent(self, j: int, latent: np.ndarray, variance: np.ndarray, modes: LatentMixture | None, i: int) -> None:
+        """Each mode of the track takes the detection's likeliest one and is weighed by how likely it made the detection."""
+        own, tracks = self.latent_variance[j].copy(), self.latent_modes
+        self.latent[j], self.latent_variance[j] = fuse_latent(self.latent[j], own, latent, variance)
+        if modes is None or tracks is None or not (variance < LARGE_VARIANCE).all():
+            return
+        seen = modes.select(np.array([i]))
+        if not (own < LARGE_VARIANCE).all():  # the first latent founds the track's modes
+            tracks.log_weight[j], tracks.mean[j] = seen.log_weight[0], seen.mean[0]
+            return
+        error = seen.mean - tracks.mean[j][:, None]
+        joint = tracks.log_weight[j][:, None] + seen.log_weight - 0.5 * np.sum(error**2 / (own + variance), axis=-1)
+        likeliest = seen.mean[0, np.argmax(joint, axis=1)]
+        tracks.mean[j] = fuse_latent(tracks.mean[j], own, likeliest, variance)[0]
+        weight = np.logaddexp.reduce(joint, axis=1)
+        tracks.log_weight[j] = weight - np.logaddexp.reduce(weight)
+        self.latent[j] = tracks.mean[j, np.argmax(weight)]
 
     def _by_mode(self, tracks: np.ndarray, modes: OrientationModes, symmetry: np.ndarray) -> np.ndarray:
         """Log density [n, K] of observed orientations given each mode of a track's, both widths added."""

@@ -28,6 +28,7 @@ from nolbo_ppl.inference.slam.incremental.keyframes import KeyframeConfig, Keyfr
 from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.running_map import MAX_FRAMES, RunningLandmark, RunningMap
 from nolbo_ppl.inference.slam.incremental.state_checks import check_links, typed_columns
+from nolbo_ppl.inference.slam.latent_mixture import LatentMixture
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
@@ -54,7 +55,8 @@ LANDMARK_NUMBERS = (
 TRACKER_ARRAYS = ("index", "mean", "covariance", "last", "oriented", "latent", "latent_variance", "category")
 MODES = ("log_weight", "R", "scale")
 DRIFT_NUMBERS = ("stride", "here", "place", "since", "moved_at", "steps")
-MEASUREMENTS = tuple(f.name for f in fields(Measurements) if f.name != "modes")
+MEASUREMENTS = tuple(f.name for f in fields(Measurements) if f.name not in ("modes", "latent_modes"))
+LATENT_MODES = ("log_weight", "mean")
 
 
 def save_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
@@ -278,6 +280,9 @@ def _put_tracks(slam: IncrementalMemory, arrays: dict[str, Any], meta: dict[str,
         arrays[f"tracker/{name}"] = getattr(tracker, name)
     for name in MODES:
         arrays[f"tracker/modes/{name}"] = getattr(tracker.modes, name)
+    if tracker.latent_modes is not None:
+        for name in LATENT_MODES:
+            arrays[f"tracker/latent_modes/{name}"] = getattr(tracker.latent_modes, name)
     numbers = list(slam.tracks)
     tracks = [slam.tracks[n] for n in numbers]
     _put_landmarks("draft", [t.draft for t in tracks], arrays)
@@ -301,6 +306,10 @@ def _get_tracks(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> 
     for name, value in typed_columns(archive, "tracker", TRACKER_ARRAYS, len(tracker.index), slam.prior).items():
         setattr(tracker, name, value)
     tracker.modes = _get_modes(archive, "tracker/modes", len(tracker.index))
+    if "tracker/latent_modes/mean" in archive.names:
+        mean = archive.array("tracker/latent_modes/mean", (*tracker.latent.shape[:1], None, *tracker.latent.shape[1:]), kinds="f")
+        log_weight = archive.array("tracker/latent_modes/log_weight", mean.shape[:2], kinds="f", finite=False)
+        tracker.latent_modes = LatentMixture(log_weight, mean)
     tracker.total = int(meta["tracks"]["total"])
     slam.tracker = tracker
     drafts = _get_landmarks("draft", archive, slam.prior)

@@ -19,6 +19,7 @@ from nolbo_ppl.inference.slam.detection_features import (
     fuse_latent,
 )
 from nolbo_ppl.inference.slam.gaussian import log_normal
+from nolbo_ppl.inference.slam.latent_mixture import likeliest_mode
 from nolbo_ppl.inference.slam.loop_candidates import TrackletFeatures, log_population
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel
@@ -86,6 +87,8 @@ class RunningLandmark:
             self.votes[category] += 1.0
         latent, variance = measurements.latent[row], measurements.latent_variance[row]
         if len(variance) and variance[0] < LARGE_VARIANCE:
+            if measurements.latent_modes is not None and self.latent_views:
+                latent = likeliest_mode(measurements.latent_modes, row, self.latent, self.latent_variance + variance)
             self.latent, self.latent_variance = fuse_latent(self.latent, self.latent_variance, latent, variance)
             self.latent_views += 1
         if np.isfinite(size).all():

@@ -60,4 +60,6 @@ def _latents(table: Detections) -> tuple[Detections, list[str]]:
     names = [str(table.id[k]) if table.id[k] is not None else f"row {k}" for k in rows[:3]]
     more = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
     text = f"the latent of {', '.join(names)}{more} lies {ABSURD:g} times the spread of all others away: set aside"
-    return replace(table, latent=cleared), [text]
+    weight = table.latent_mode_weight.copy()
+    weight[rows] = 0.0
+    return replace(table, latent=cleared, latent_mode_weight=weight), [text]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nolbo_ppl.geometry.pose import relative, so3_log
+from nolbo_ppl.inference.slam.latent_mixture import nearest_difference
 from nolbo_ppl.inference.slam.noise.neighbour_gaps import SURE_GAIN, NeighbourGaps, consecutive_pairs
 from nolbo_ppl.inference.slam.noise.view_volume import view_volume
 from nolbo_ppl.inference.slam.orientation import nearest_of_modes, observed_modes, resolved_symmetry
@@ -239,7 +240,7 @@ def _latent_scale(
     both = table.has_latent[pairs.first] & table.has_latent[pairs.second] if len(pairs.first) else np.zeros(0, bool)
     if both.sum() >= 5:
         i, j = pairs.first[both], pairs.second[both]
-        difference = table.latent[j] - table.latent[i]
+        difference = nearest_difference(table, i, j)
         weight = np.repeat(pairs.weight[both], difference.shape[1])
         measured = robust_scale(difference.ravel(), weight) / np.sqrt(2)
         report["latent_scale"] = measured

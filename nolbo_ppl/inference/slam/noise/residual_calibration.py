@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.inference.slam.graph import inflated
+from nolbo_ppl.inference.slam.latent_mixture import resolved_latents
 from nolbo_ppl.inference.slam.noise.fitted_residuals import (
     block_ratio,
     fitted_residuals,
@@ -177,7 +178,8 @@ def latent_width(state: SlamState) -> float:
     if len(rows) < MIN_DETECTIONS:
         return float("nan")
     track = np.unique(state.tracklets.of_observation[rows], return_inverse=True)[1]
-    latent, scale = state.problem.observations.latent[rows], state.noise.latent_scale[rows]
+    seen, scale = state.measurements.select(rows), state.noise.latent_scale[rows]
+    latent = resolved_latents(seen.latent, seen.latent_variance, seen.latent_modes, track, np.ones(len(rows)))
     precision, total = (np.zeros((track.max() + 1, latent.shape[1])) for _ in range(2))
     np.add.at(precision, track, scale**-2.0)
     np.add.at(total, track, latent / scale**2)
