@@ -322,7 +322,7 @@ def _get_tracks(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> 
     for row, (number, frame) in enumerate(waiting):
         part = slice(row, row + 1)
         own = OrientationModes(modes.log_weight[part], modes.R[part], modes.scale[part])
-        measurement = Measurements(**{name: columns[name][part] for name in MEASUREMENTS}, modes=own)
+        measurement = Measurements(**{name: columns[name][part] for name in MEASUREMENTS}, modes=own, latent_modes=None)
         slam.tracks[int(number)].waiting.append((int(frame), measurement))
 
 
