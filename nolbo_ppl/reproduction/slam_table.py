@@ -38,6 +38,10 @@ LOOP_GAP = 60
 """Frames between two detections of an object that are a loop pair."""
 OVERLAP = 0.5
 """Overlap of a detection's box with the object it is of."""
+CLUTTER = 0.1
+"""Overlap below which a detection is of no object; between the two nobody knows whose it is."""
+UNKNOWN = -2
+"""In the place of an object's number: nobody knows; such detections have no say in loop pairs."""
 
 
 @dataclass(frozen=True)
@@ -140,14 +144,14 @@ def observations_of(config: ReproduceConfig, drive: Drive, name: str, seed: int,
 
 
 def true_objects(detections: Detections, drive: Drive) -> Int[np.ndarray, " n"]:
-    """True object of each detection by the overlap of boxes, -1 for none."""
+    """True object of each detection by the overlap of boxes, -1 for none, `UNKNOWN` for a box that fits none well."""
     out = np.full(len(detections), -1)
     for frame in np.unique(detections.frame):
         rows, labels = np.flatnonzero(detections.frame == frame), np.flatnonzero(drive.frame == frame)
         if len(labels):
             iou = pairwise_iou(torch.from_numpy(detections.box[rows]), torch.from_numpy(drive.box[labels])).numpy()
-            best = iou.argmax(1)
-            out[rows] = np.where(iou.max(1) >= OVERLAP, drive.object[labels[best]], -1)
+            best, overlap = iou.argmax(1), iou.max(1)
+            out[rows] = np.where(overlap >= OVERLAP, drive.object[labels[best]], np.where(overlap < CLUTTER, -1, UNKNOWN))
     return out
 
 
@@ -191,8 +195,9 @@ def score_slam(drive: Drive, odometry: Float[np.ndarray, "n 4 4"], detections: D
     config = SlamConfig(latent_correlation=correlation, hypotheses=1)
     result: SlamResult = solve(SlamProblem(odometry, detections), config)
     errors = trajectory_errors(result.T_world_camera, drive.T_world_camera)
-    landmark = association_table(result).landmark_of
-    pairs = association_pairs(detections.frame, true_objects(detections, drive), landmark, LOOP_GAP)
+    landmark, truth = association_table(result).landmark_of, true_objects(detections, drive)
+    told = truth != UNKNOWN
+    pairs = association_pairs(detections.frame[told], truth[told], landmark[told], LOOP_GAP)
     recall = pairs.recall if pairs.true_pairs else np.nan
     precision = pairs.precision if pairs.found_pairs else np.nan
     return DriveScores(errors["ate"], errors["rpe_translation"], recall, precision)

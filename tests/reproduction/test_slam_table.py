@@ -13,7 +13,7 @@ from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 from nolbo_ppl.reproduction.budgets import ReproduceConfig
 from nolbo_ppl.reproduction.estep_time import simulated_state, time_e_step
-from nolbo_ppl.reproduction.slam_table import Drive, odometry_of, paths, score_odometry, true_objects
+from nolbo_ppl.reproduction.slam_table import UNKNOWN, Drive, odometry_of, paths, score_odometry, true_objects
 from nolbo_ppl.structures.detections import Detections
 
 
@@ -27,7 +27,7 @@ def test_whose_a_detection_is() -> None:
     seen = Detections.from_arrays(
         [0, 0, 1, 2], np.ones((4, 3)), box=[[19.0, 0, 41, 10], [0.0, 0, 3, 10], [1.0, 0, 12, 10], [0.0, 0, 10, 10]]
     )
-    assert true_objects(seen, drive(np.tile(np.eye(4), (3, 1, 1)))).tolist() == [7, -1, 4, -1]
+    assert true_objects(seen, drive(np.tile(np.eye(4), (3, 1, 1)))).tolist() == [7, UNKNOWN, 4, -1]
 
 
 def test_the_odometry_of_a_drive() -> None:
