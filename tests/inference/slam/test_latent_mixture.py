@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from nolbo_ppl.geometry.pose import make_pose
+from nolbo_ppl.inference.slam import IncrementalSlam
 from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.initialise import init
 from nolbo_ppl.inference.slam.latent_mixture import (
@@ -190,3 +192,28 @@ def test_the_plain_em_with_modes_never_falls_and_finds_the_category(seed: int) -
     np.testing.assert_allclose(state.latent, latent, atol=5 * SCALE / np.sqrt(FRAMES))
     shares, weights, _ = e_step(state)
     assert weights.shape == (len(problem.observations), 3) and np.isfinite(shares).all()
+
+
+def test_online_tracks_stay_whole_and_are_saved_with_their_modes(tmp_path: Path) -> None:
+    """Half of the drive, a file, the other half: the same tracks as without the file, one landmark an object."""
+    problem, latent, _ = flips()
+    table = problem.observations
+    config = SlamConfig(odometry_rotation_scale=0.001, odometry_translation_ratio=0.01)
+    slam = IncrementalSlam(config, SlamProblem(problem.odometry[:4], table.select(table.frame < 4)))
+    for t in range(10):
+        slam.update(problem.odometry[t], table.select(table.frame == t))
+    assert slam.tracker is not None and slam.tracker.latent_modes is not None
+    assert slam.tracker.latent_modes.several.all() and slam.tracker.total == len(latent)
+    slam.save(tmp_path / "state.npz")
+    again = IncrementalSlam.load(tmp_path / "state.npz")
+    for t in range(10, 16):
+        for one in (slam, again):
+            one.update(problem.odometry[t], table.select(table.frame == t))
+    assert again.tracker is not None and again.tracker.latent_modes is not None
+    np.testing.assert_array_equal(again.tracker.latent_modes.mean, slam.tracker.latent_modes.mean)
+    np.testing.assert_array_equal(again.tracker.latent_modes.log_weight, slam.tracker.latent_modes.log_weight)
+    assert slam.tracker.total == len(latent) and len(slam.landmarks()) == len(again.landmarks()) == len(latent)
+    error = (slam.tracker.latent - latent[np.argsort(np.argsort(slam.tracker.mean[:, 0]))]) / np.sqrt(
+        slam.tracker.latent_variance
+    )
+    assert np.abs(error).max() < 5  # each track is of its true category by now

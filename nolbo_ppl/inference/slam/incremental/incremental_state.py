@@ -34,7 +34,7 @@ from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.io.npz import Npz, save_npz
 from nolbo_ppl.renamed_options import current_names, stored_names
-from nolbo_ppl.structures.detections import ARRAYS, TEXTS, Detections
+from nolbo_ppl.structures.detections import ARRAYS, OPTIONAL, TEXTS, Detections
 
 VERSION = 2
 """Version of the file."""
@@ -350,7 +350,8 @@ def _put_history(slam: IncrementalMemory, arrays: dict[str, Any], meta: dict[str
 def _get_history(slam: IncrementalMemory, archive: Npz, meta: dict[str, Any]) -> None:
     if not slam.keyframes.history:
         return
-    columns: dict[str, Any] = {name: archive.array(f"history/{name}", finite=False) for name in ARRAYS}
+    kept = [name for name in ARRAYS if name not in OPTIONAL or f"history/{name}" in archive.names]  # older files have fewer
+    columns: dict[str, Any] = {name: archive.array(f"history/{name}", finite=False) for name in kept}
     columns |= {name: tuple(meta["history"][name]) for name in (*TEXTS, "class_names")}
     table = Detections(**columns)
     slam.odometry = list(archive.array("history/odometry", (slam.frames, 4, 4)))
