@@ -1,10 +1,11 @@
 """Draw the posterior over a photograph: `python benchmarks/photograph_picture.py --out picture.jpg`.
 
-`coffee`, carried by scikit-image, is the picture of the documents (CC0, Rachel Michetti). The others are drawn where you are and
-are not part of this project. `desk` is a frame of TUM RGB-D freiburg1_desk (CC BY 4.0, J. Sturm, N. Engelhard, F. Endres, W. Burgard and D. Cremers, TU Munich;
-vision.in.tum.de/data/datasets/rgbd-dataset), with `--data` the folder that holds `sequences/tum_fr1_desk`; its lens is known and
-undone. `motorcycle` is one of the Middlebury stereo pictures, under its authors' terms. Its camera is known (focal length 995 px), and so is the truth: the motorbike stands 2.4 m away
-(median of the disparities around its engine).
+`coffee`, carried by scikit-image, is the picture of the documents (CC0, Rachel Michetti). The others are drawn where you are
+and are not part of this project. `desk` is a frame of TUM RGB-D freiburg1_desk (CC BY 4.0, J. Sturm, N. Engelhard, F. Endres,
+W. Burgard and D. Cremers, TU Munich; vision.in.tum.de/data/datasets/rgbd-dataset), with `--data` the folder that holds
+`sequences/tum_fr1_desk`; its lens is known and undone. `motorcycle` is one of the Middlebury stereo pictures, under its
+authors' terms. Its camera is known (focal length 995 px), and so is the truth: the motorbike stands 2.4 m away (median of
+the disparities around its engine).
 """
 
 from __future__ import annotations
