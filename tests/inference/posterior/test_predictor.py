@@ -23,7 +23,7 @@ from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observed_scene import RegionParameters
 from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import cell_of, decode_box, decode_range
-from nolbo_ppl.structures.object_posteriors import ObjectPosteriors, ViewpointModes
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 from tests.factories import instance_config, tiny_config, tiny_model
 
 CAMERA = [70.0, 74.0, 33.0, 29.0]
@@ -49,7 +49,7 @@ def assert_same(a: ObjectPosteriors, b: ObjectPosteriors, tolerance: float = 1e-
     assert len(a) == len(b)
     for field in dataclasses.fields(ObjectPosteriors):
         x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, ViewpointModes):
+        if dataclasses.is_dataclass(x):
             for part in dataclasses.fields(x):
                 np.testing.assert_allclose(getattr(x, part.name), getattr(y, part.name), atol=tolerance, rtol=tolerance)
         elif isinstance(x, np.ndarray):
