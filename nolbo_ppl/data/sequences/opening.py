@@ -12,6 +12,7 @@ from nolbo_ppl.data.sequences.bag_frames import BagFrames
 from nolbo_ppl.data.sequences.image_sequence import FrameSequence, ImageFolder, TumFolder, list_frames
 from nolbo_ppl.data.sequences.video import VIDEO_SUFFIXES, VideoFile
 from nolbo_ppl.errors import input_error
+from nolbo_ppl.io.images import IMAGE_SUFFIXES
 from nolbo_ppl.io.ros_bags import is_bag
 from nolbo_ppl.io.text import read_times
 
@@ -42,8 +43,8 @@ def find_times(folder: Path, top: Path, count: int) -> Float[np.ndarray, " n"] |
 
 
 def open_frames(path: str | PathLike[str], topic: str | None = None, depth: str | PathLike[str] | None = None) -> FrameSequence:
-    """Open a sequence: a TUM RGB-D folder (`rgb.txt`), a folder of images or one that holds `image_2` or the like, a video, or
-    a topic of a ROS bag (extra `ros`).
+    """Open a sequence: a TUM RGB-D folder (`rgb.txt`), a folder of images or one that holds `image_2` or the like, one image,
+    a video, or a topic of a ROS bag (extra `ros`).
 
     Args:
         path: the folder or file; of a bag also `BAG:/topic`.
@@ -59,11 +60,13 @@ def open_frames(path: str | PathLike[str], topic: str | None = None, depth: str 
     if topic is not None:
         raise input_error("--topic", got=topic, expected="a bag of ROS as --images", file=path)
     if path.is_file():
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            return ImageFolder(path, [path])
         if path.suffix.lower() not in VIDEO_SUFFIXES:
             raise input_error(
                 "not a sequence of frames",
                 got=path.name,
-                expected="a folder, a video (" + ", ".join(VIDEO_SUFFIXES) + ") or a bag of ROS (.bag, .mcap, .db3)",
+                expected="a folder, an image, a video (" + ", ".join(VIDEO_SUFFIXES) + ") or a bag of ROS (.bag, .mcap, .db3)",
                 file=path,
             )
         return VideoFile(path)

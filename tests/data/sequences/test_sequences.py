@@ -108,6 +108,15 @@ def test_nothing_to_open(tmp_path: Path) -> None:
         open_frames(tmp_path / "a.txt")
 
 
+def test_one_image_is_a_sequence_of_one(tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
+    for name in ("a.png", "b.png"):
+        Image.fromarray(colours).save(tmp_path / name)
+    frames = open_frames(tmp_path / "b.png")
+    assert len(frames) == 1 and frames.size == (8, 6)
+    np.testing.assert_array_equal(frames.image(0), colours)
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [
