@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.graph import GraphError, SlamEstimate, named_error, to_values
 
-SAMPLED_BLOCKS, LARGEST_SAMPLE = 50_000, 4
+SAMPLED_BLOCKS, LARGEST_SAMPLE = 20_000, 4
 """Samples of a small graph: as many as make so many poses and landmarks, at most this multiple of the configured number."""
 
 
