@@ -36,6 +36,9 @@ PROBES = 8
 """Camera positions, evenly over the drive, by which two associations are told apart."""
 ALIKE = 2
 """Associations kept of which both trajectory and its uncertainty are alike."""
+SAME_PATH, OTHER_PATH = 1.0, 2.0
+"""Trajectories are alike when their probes differ by less than the first, in standard deviations of a gap's coordinate (root mean
+square). Answers differ by the second at least: the soft EM takes what is nearer to one map."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,11 @@ class _Branch:
     """Tracklets that still matter: the objects' first ones, then all to come; after them `mean` has the probes."""
     mean: np.ndarray
     covariance: np.ndarray
+
+    @property
+    def path(self) -> np.ndarray:
+        """Means of the probes."""
+        return self.mean[len(self.index) :]
 
 
 @dataclass
@@ -155,8 +163,7 @@ def search(
         beam = [_carry_out(child, a, last, floor) for child in _select(children, floor)]
     distinct: list[_Branch] = []
     for branch in sorted(beam, key=lambda branch: -branch.log_odds):
-        away = [np.mean(np.sum((branch.mean[-(n - m) :] - other.mean[-(n - m) :]) ** 2, axis=1)) for other in distinct]
-        if not away or min(away) >= 3 * (2 * floor) ** 2:
+        if all(_deviation(branch.path, other.path) >= OTHER_PATH * floor for other in distinct):
             distinct.append(branch)
     return [WholeAssociation(branch.root, branch.log_odds) for branch in distinct[:count]]
 
@@ -168,7 +175,7 @@ def _children(
     objects = len(branch.index) - left  # the objects' first tracklets stand before those to come
     probes = np.arange(len(branch.index), len(branch.mean))
     blocks = branch.covariance.reshape(len(branch.mean), 3, -1, 3)
-    path = branch.mean[probes]
+    path = branch.path
     out = [_Child(branch.log_odds, branch, -1, path, float(np.einsum("kii->", blocks[probes, :, probes])))]
     free = np.flatnonzero(branch.last[branch.index[:objects]] < first[a])
     if not len(free):
@@ -199,11 +206,16 @@ def _select(children: list[_Child], floor: float) -> list[_Child]:
             break
         alike = 0
         for other in kept:
-            near = np.mean(np.sum((child.path - other.path) ** 2, axis=1)) < 3 * floor**2
-            alike += bool(near) and 0.5 < child.spread / other.spread < 2.0
+            near = _deviation(child.path, other.path) < SAME_PATH * floor
+            alike += near and 0.5 < child.spread / other.spread < 2.0
         if alike < ALIKE:
             kept.append(child)
     return kept
+
+
+def _deviation(a: np.ndarray, b: np.ndarray) -> float:
+    """Root mean square of the differences of coordinates, m."""
+    return float(np.sqrt(np.mean((a - b) ** 2)))
 
 
 def _carry_out(child: _Child, a: int, last: np.ndarray, floor: float) -> _Branch:

@@ -100,8 +100,8 @@ class SlamConfig:
     that makes them its scale matrices. None: Gaussian, or what `stated_tails` asks for."""
     stated_tails: bool = False
     """Take the law that detections state for their positions (`Detections.position_tails`; what a model's calibration found).
-    It is that of single detections, in its bulk narrower than their covariances; views of one object err together, and on the
-    drive of `nolbo demo` the error after SLAM was 0.124 m with it, 0.100 m without (no other drive was measured)."""
+    It is that of single detections, in its bulk narrower than their covariances, and views of one object err together: on four
+    generated drives the error after SLAM was 0.088, 0.084, 0.064 and 0.124 m with it, 0.090, 0.127, 0.063 and 0.100 m without."""
     rotation_scale: float | None = None
     """Standard deviation of each angle of an observed orientation, rad, for observations that state none."""
     latent_scale: float | None = None

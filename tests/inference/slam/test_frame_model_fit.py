@@ -15,26 +15,14 @@ from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.frame_model_fit import OFFSET_SCALE, SLOPE_SCALE, estimate_frame_model
 from nolbo_ppl.inference.slam.measurements import Measurements
-from nolbo_ppl.inference.slam.orientation import OrientationModes
+from tests.position_measurements import position_measurements
 
 
 def scored(log_odds: np.ndarray, rng: np.random.Generator) -> Measurements:
     """Detections in view with these log likelihood ratios of their scores."""
     n = len(log_odds)
-    return Measurements(
-        frame=np.arange(n) % 20,
-        position=np.array([0.0, 0.0, 8.0]) + rng.standard_normal((n, 3)),
-        covariance=np.tile(0.01 * np.eye(3), (n, 1, 1)),
-        shared_root=np.zeros((n, 3, 3)),
-        oriented=np.zeros(n, bool),
-        modes=OrientationModes(np.zeros((n, 1)), np.tile(np.eye(3), (n, 1, 1, 1)), np.ones((n, 1))),
-        symmetry=np.ones(n, np.int64),
-        latent=np.zeros((n, 0)),
-        latent_variance=np.zeros((n, 0)),
-        category=np.full(n, -1),
-        log_object=log_odds,
-        log_clutter=np.zeros(n),
-    )
+    position = np.array([0.0, 0.0, 8.0]) + rng.standard_normal((n, 3))
+    return position_measurements(position, np.tile(0.01 * np.eye(3), (n, 1, 1)), log_odds, np.arange(n) % 20)
 
 
 def test_the_score_is_fitted_to_the_maximum_of_its_posterior() -> None:

@@ -10,30 +10,10 @@ from scipy.stats import multivariate_normal
 
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
-from nolbo_ppl.inference.slam.measurements import Measurements
-from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.tracking import Tracker
+from tests.position_measurements import position_measurements
 
 PRIOR = FeaturePrior(np.zeros(0), np.zeros(0), (), np.zeros(0), 0.05)
-
-
-def detections(position: np.ndarray, covariance: np.ndarray, log_odds: float = 2.0) -> Measurements:
-    """Positions in the world alone."""
-    n = len(position)
-    return Measurements(
-        frame=np.zeros(n, np.int64),
-        position=position,
-        covariance=covariance,
-        shared_root=np.zeros((n, 3, 3)),
-        oriented=np.zeros(n, bool),
-        modes=OrientationModes(np.zeros((n, 1)), np.tile(np.eye(3), (n, 1, 1, 1)), np.ones((n, 1))),
-        symmetry=np.ones(n, np.int64),
-        latent=np.zeros((n, 0)),
-        latent_variance=np.zeros((n, 0)),
-        category=np.full(n, -1),
-        log_object=np.full(n, log_odds),
-        log_clutter=np.zeros(n),
-    )
 
 
 def covariances(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -60,7 +40,7 @@ def test_a_track_is_the_posterior_of_a_walk() -> None:
             information[before, before] += drift
             information[own, before] -= drift
             information[before, own] -= drift
-        assigned, _ = tracker.associate(detections(position[[t]], covariance[[t]]), t)
+        assigned, _ = tracker.associate(position_measurements(position[[t]], covariance[[t]]), t)
         assert assigned.tolist() == [0]
         information[own, own] += np.linalg.inv(covariance[t])
         vector[own] += np.linalg.solve(covariance[t], position[t])
@@ -76,7 +56,7 @@ def test_weights_of_a_frame_equal_enumeration() -> None:
     place = np.array([[0.0, 0.0, 5.0], [0.4, 0.0, 5.0]])
     first = covariances(rng, 2)
     tracker = Tracker(SlamConfig(), 0, PRIOR, birth, clutter)
-    assert tracker.associate(detections(place, first), 0)[0].tolist() == [0, 1]
+    assert tracker.associate(position_measurements(place, first), 0)[0].tolist() == [0, 1]
     tracker.predict(np.eye(4), 1, 0.0, 0.1)
     position = np.array([[0.1, 0.0, 5.1], [0.35, 0.1, 5.0], [0.2, 0.3, 4.9]])
     covariance = covariances(rng, 3)
@@ -100,7 +80,7 @@ def test_weights_of_a_frame_equal_enumeration() -> None:
                 else:
                     weight[k, j] += value
     weight, null = weight / total, null / total
-    assigned, stated = tracker.associate(detections(position, covariance, log_odds), 1)
+    assigned, stated = tracker.associate(position_measurements(position, covariance, log_odds), 1)
     best = np.where(weight.max(axis=1) > 0.5, weight.argmax(axis=1), -1)
     assert (best >= 0).sum() == 2  # two detections continue the tracks
     np.testing.assert_array_equal(assigned[best >= 0], best[best >= 0])
@@ -111,8 +91,8 @@ def test_weights_of_a_frame_equal_enumeration() -> None:
 def test_a_track_ends_after_its_gap(wait: int, same: bool) -> None:
     tracker = Tracker(SlamConfig(track_gap=3), 0, PRIOR, 1e-3, 1e-4)
     place, covariance = np.array([[0.0, 0.0, 5.0]]), 0.01 * np.eye(3)[None]
-    tracker.associate(detections(place, covariance), 0)
+    tracker.associate(position_measurements(place, covariance), 0)
     for frame in range(1, wait + 1):
         tracker.predict(np.eye(4), frame, 1e-3, 1e-2)
-    assert tracker.associate(detections(place, covariance), wait)[0].tolist() == [0 if same else 1]
+    assert tracker.associate(position_measurements(place, covariance), wait)[0].tolist() == [0 if same else 1]
     assert len(tracker.index) == 1 and tracker.total == (1 if same else 2)
