@@ -26,8 +26,10 @@ class Budget:
     """Steps on scenes (on crops, for single objects)."""
     batch: int
     """Scenes a step."""
-    image_size: int
+    render_size: int
     """Side of the scenes, px."""
+    image_size: int
+    """Side at which the networks see them, px."""
     frames: int
     """Frames of a drive at most."""
     step: float
@@ -43,9 +45,9 @@ class Budget:
 
 
 BUDGETS: dict[BudgetName, Budget] = {
-    "smoke": Budget(24, 12, 2, 2, 4, 64, 40, 2.0, (128, 64), 3, 2, 30),
-    "small": Budget(1024, 192, 120, 160, 32, 128, 1500, 2.5, (256, 128), 1500, 5, 100),
-    "full": Budget(16384, 1024, 1200, 4000, 64, 192, 4600, 1.0, (384, 192), 6000, 50, 800),
+    "smoke": Budget(24, 12, 2, 2, 4, 64, 64, 40, 2.0, (128, 64), 3, 2, 30),
+    "small": Budget(1024, 192, 120, 160, 16, 128, 192, 600, 2.5, (256, 128), 1500, 5, 100),
+    "full": Budget(16384, 1024, 1200, 4000, 64, 128, 256, 4600, 1.0, (384, 192), 6000, 50, 800),
 }
 """By name: a few seconds for tests, minutes a network on two cores, and what the shipped weights were trained with."""
 

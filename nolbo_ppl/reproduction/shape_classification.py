@@ -33,7 +33,7 @@ from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import pack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.progress import progress_bar
-from nolbo_ppl.training.detector_file import SHAPE_FEATURES, adopt_features
+from nolbo_ppl.training.initial_weights import SHAPE_FEATURES, adopt_features
 from nolbo_ppl.training.stages import StageRun, TrainingStage, seeded_noise
 
 

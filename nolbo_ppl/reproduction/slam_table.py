@@ -34,6 +34,8 @@ SEQUENCES = ("00", "06", "08")
 """Paths of KITTI odometry that are driven."""
 ROTATION_SCALE, TRANSLATION_RATIO = 0.006, 0.02
 """White noise of the odometry's steps, rad and m per m: as weak as the paper's, whose error is 31 on paths of kilometres."""
+RENDERED = 128
+"""Side of the scenes that shipped weights learnt from, px (`TrainConfig.render_sizes`)."""
 LOOP_GAP = 60
 """Frames between two detections of an object that are a loop pair."""
 OVERLAP = 0.5
@@ -123,11 +125,18 @@ def _number(name: str) -> int:
     return sum((k + 1) * ord(letter) for k, letter in enumerate(name))
 
 
-def observe_drive(model: ObservationModel, drive: Drive, batch: int = 16) -> Detections:
-    """What a network observes in every frame, without shapes."""
+def observe_drive(model: ObservationModel, drive: Drive, zoom: float, batch: int = 16) -> Detections:
+    """What a network observes in every frame, without shapes.
+
+    Args:
+        model: the network.
+        drive: its images.
+        zoom: how many times larger than they were rendered the network saw the scenes it learnt from. Frames are enlarged as
+            much, so that objects keep the size in px they were learnt at: smaller ones are taken to be nearer than they are.
+        batch: frames at once.
+    """
     tables = []
-    # The longer side of the frames stands for that of the scenes learnt from: objects keep the size in px they were learnt at.
-    size = max(32, round(max(drive.images.shape[1:3]) / 32) * 32)
+    size = max(32, round(zoom * max(drive.images.shape[1:3]) / 32) * 32)
     for first in progress_bar(range(0, len(drive.images), batch), f"observing {drive.name}", "batch"):
         part = list(drive.images[first : first + batch])
         for k, seen in enumerate(model.observe(part, drive.intrinsics, size=size, decode=False, batch=batch)):
@@ -139,7 +148,8 @@ def observations_of(config: ReproduceConfig, drive: Drive, name: str, seed: int,
     """What a network observes of a drive, kept in a file that later calls read."""
     file = config.out / "observations" / config.budget / f"{drive.name}-{config.label(name, seed)}.jsonl"
     if not file.is_file():
-        write_observations(file, observe_drive(model, drive))
+        rendered = RENDERED if name in config.weights else config.sizes.render_size
+        write_observations(file, observe_drive(model, drive, model.config.image_size / rendered))
     return read_observations(file)
 
 

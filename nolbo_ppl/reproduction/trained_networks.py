@@ -1,4 +1,4 @@
-"""The compared networks, trained alike: one encoder that stays as it is, the same scenes, the same number of steps."""
+"""The compared networks, trained alike: one detector to start from, whose encoder stays as it is, the same scenes and steps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from nolbo_ppl.training.trainer import run
 TRAIN_SEED, HELD_OUT_SEED = 301, 9301
 """Seeds of the generated scenes: neither scenes nor shapes of one are among those of the other."""
 INITIAL = "tiny"
-"""Shipped weights whose features all start from."""
+"""Shipped weights from which all start, but for latent and prior."""
 
 
 def own_scenes(config: ReproduceConfig) -> Path | None:
@@ -44,7 +44,7 @@ def scene_folder(config: ReproduceConfig, held_out: bool) -> Path:
     sizes = config.sizes
     name, seed, count = ("held_out", HELD_OUT_SEED, sizes.held_out) if held_out else ("train", TRAIN_SEED, sizes.scenes)
     folder = config.out / "scenes" / config.budget / name
-    source = SceneGenerator(preset("standard" if config.budget != "smoke" else "easy", sizes.image_size), seed)
+    source = SceneGenerator(preset("standard" if config.budget != "smoke" else "easy", sizes.render_size), seed)
     write_scenes(folder, source, count, config.workers)
     return folder
 
@@ -58,7 +58,7 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         method=network.method,
         latent_dim=network.latent_dim,
         initial=INITIAL,
-        initial_part="features",
+        initial_part="detection",
         freeze_encoder=True,
         scenes=(scene_folder(config, held_out=False),),
         validation=None if own_scenes(config) is not None else scene_folder(config, held_out=True),
@@ -68,7 +68,7 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         single_steps=0,
         scene_steps=sizes.scene_steps,
         batch=sizes.batch,
-        shape_batch=min(32, sizes.batch),
+        shape_batch=32 if sizes.batch > 4 else sizes.batch,
         shape_decode=8,
         evaluate_every=10**6,
         evaluate_scenes=64,

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from nolbo_ppl.errors import input_error
-from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.yolox import ScaledConv, YoloxNano
 
 
@@ -49,52 +48,3 @@ def read_detector(path: str | os.PathLike[str]) -> YoloxNano:
     for unit, (kernel, bias) in zip(units, kernels):
         unit.set_kernel(torch.from_numpy(kernel), torch.from_numpy(bias))
     return model.eval()
-
-
-LOOK = "guide.shape_look."
-"""What the names of weights of a look at shapes begin with."""
-
-
-def adopt(model: Nolbo, initial: Nolbo, detector: str | os.PathLike[str] | None) -> None:
-    """Give a model the weights of another one, and those of a detector or of a look at shapes that the other has not.
-
-    Raises:
-        InputError: the model has a detector, the other has none, and no file is given; or the file cannot be used.
-    """
-    state = initial.state_dict()
-    if model.config.shape_look and not initial.config.shape_look:  # its encoder starts from the guide's
-        own = {f"{LOOK}encoder.{name}": value for name, value in initial.guide.encoder.state_dict().items()}
-        state |= {name: value for name, value in model.state_dict().items() if name.startswith(LOOK)} | own
-    if model.config.detector and not initial.config.detector:
-        if detector is None:
-            raise input_error("the preset photo without a detector", do="give --detector yolox_nano.onnx")
-        state = {**model.state_dict(), **state}
-    model.load_state_dict(state)
-    if detector is not None:
-        model.guide.get_submodule("detector").load_state_dict(read_detector(detector).state_dict())
-
-
-SHAPE_FEATURES = ("story.decoder.layers.", "shape_guide.encoder.layers.")
-"""Convolutions of the shape networks."""
-FEATURES = ("guide.encoder.", *SHAPE_FEATURES)
-"""Parts of the networks that features are: what depends neither on the latent nor on the method."""
-
-
-def adopt_features(model: Nolbo, initial: Nolbo, parts: tuple[str, ...] = FEATURES) -> None:
-    """Give a model the features of another one; heads, latent and prior networks stay as they are.
-
-    Args:
-        model: the networks to change.
-        initial: where the features come from.
-        parts: which ones, by the beginnings of their names.
-
-    Raises:
-        InputError: features of another size.
-    """
-    own, given = model.state_dict(), initial.state_dict()
-    names = [name for name in {**own, **given} if name.startswith(parts)]
-    wrong = sorted(name for name in names if name not in own or name not in given or own[name].shape != given[name].shape)
-    if wrong:
-        got = f"{len(wrong)} tensors of other shapes, {wrong[0]}"
-        raise input_error("features of the initial weights", got=got, do="give --preset of theirs")
-    model.load_state_dict({**own, **{name: given[name] for name in names}})

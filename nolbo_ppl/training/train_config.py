@@ -129,9 +129,10 @@ class TrainConfig:
     initial: str | None = None
     """Weights to start from: a name of shipped weights, or the folder of a model; the networks' configuration is theirs.
     With `--shape-steps 0` the shape networks stay as they are."""
-    initial_part: Literal["all", "features"] = "all"
-    """What is taken of the initial weights: everything, or the features (image encoder, convolutions of decoder and 3D encoder),
-    for networks of the preset whose heads, latent and prior start afresh."""
+    initial_part: Literal["all", "detection", "features"] = "all"
+    """What is taken of the initial weights: everything; or the features (image encoder, convolutions of decoder and 3D encoder),
+    for networks of the preset whose heads, latent and prior start afresh; or (`detection`) these and all of the head that does
+    not describe the shape latent, so that only latent and prior do."""
     freeze_encoder: bool = False
     """The image encoder stays as it is: a quarter of the time a step, for comparing what is built on one encoder."""
     shape_look: int = 0

@@ -33,7 +33,7 @@ from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
-from nolbo_ppl.training.detector_file import adopt, adopt_features
+from nolbo_ppl.training.initial_weights import adopt, adopt_detection, adopt_features
 from nolbo_ppl.training.domain_fit import contexts_of, fit_domain, learn_sizes
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
 from nolbo_ppl.training.model_card import write_card
@@ -89,10 +89,10 @@ def _run(config: TrainConfig, rank: int, world: int, device: torch.device) -> Tr
         initial, given = loaded.model, loaded.calibration
         if config.grow:
             initial = grow(initial, model.config, config.seed)
-        if config.initial_part == "features":
-            adopt_features(model, initial)
-        else:
+        if config.initial_part == "all":
             adopt(model, initial, config.detector)
+        else:
+            (adopt_features if config.initial_part == "features" else adopt_detection)(model, initial)
     model.to(device)
     if config.compile:
         compile_networks(model)

@@ -19,7 +19,7 @@ from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
-from nolbo_ppl.training.detector_file import LOOK, adopt
+from nolbo_ppl.training.initial_weights import LOOK, adopt
 from nolbo_ppl.training.stages import StageRun, TrainingStage
 from nolbo_ppl.training.train_config import TrainConfig
 from nolbo_ppl.training.trainer import run
