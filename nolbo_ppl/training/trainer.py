@@ -33,9 +33,9 @@ from nolbo_ppl.models.posterior_calibration import Calibration
 from nolbo_ppl.models.scene_batch import SceneBatch
 from nolbo_ppl.progress import progress_bar
 from nolbo_ppl.training.calibrate import TooFewObjects, calibrate
-from nolbo_ppl.training.initial_weights import adopt, adopt_detection, adopt_features
 from nolbo_ppl.training.domain_fit import contexts_of, fit_domain, learn_sizes
 from nolbo_ppl.training.evidence_fit import EvidenceTable, fit_fusion, gather_table, join_tables, table_of, table_tensors
+from nolbo_ppl.training.initial_weights import adopt, adopt_detection, adopt_features
 from nolbo_ppl.training.model_card import write_card
 from nolbo_ppl.training.net2net import grow
 from nolbo_ppl.training.photograph_fit import PARTS, PhotographFit, adopt_fit, find_objects, fit_found

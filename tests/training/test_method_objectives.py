@@ -28,7 +28,7 @@ from nolbo_ppl.models.posterior_calibration import CERTAIN, Calibration
 from nolbo_ppl.models.scene_batch import decode_range, encode_range, unpack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
 from nolbo_ppl.training.calibrate import about_mean, calibrate
-from nolbo_ppl.training.initial_weights import adopt_detection, adopt_features
+from nolbo_ppl.training.initial_weights import adopt_features
 from nolbo_ppl.training.method_objectives import AdversarialLoss, JointLoss, image_weights, shape_weights
 from nolbo_ppl.training.stages import OBJECTIVES, StageRun, TrainingStage, scene_weights
 from nolbo_ppl.training.train_config import TrainConfig
