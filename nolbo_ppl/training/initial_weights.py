@@ -91,7 +91,7 @@ def adopt_detection(model: Nolbo, initial: Nolbo) -> None:
     given = {name: value for name, value in initial.state_dict().items() if name.startswith(head)}
     adopted: dict[str, Tensor] = {}
     for name, value in own.items():
-        last = name.startswith((f"{head}outputs.6.", f"{head}glimpse.judge.3."))
+        last = name.startswith((f"{head}outputs.6.", f"{head}outputs.weight", f"{head}glimpse.judge.3."))
         rows = (
             (_rows_but_latent(model, len(value)), _rows_but_latent(initial, len(given[name]))) if last and name in given else None
         )

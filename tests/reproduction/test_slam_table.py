@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import nolbo_ppl
 from nolbo_ppl.data.simulated_paths import figure_of_eight
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 from nolbo_ppl.reproduction.budgets import ReproduceConfig
 from nolbo_ppl.reproduction.estep_time import simulated_state, time_e_step
-from nolbo_ppl.reproduction.slam_table import UNKNOWN, Drive, odometry_of, paths, score_odometry, true_objects
+from nolbo_ppl.reproduction.slam_table import (
+    UNKNOWN,
+    Drive,
+    observe_drive,
+    odometry_of,
+    paths,
+    score_odometry,
+    true_objects,
+)
 from nolbo_ppl.structures.detections import Detections
+from nolbo_ppl.structures.object_posteriors import ObjectPosteriors
 
 
 def drive(T: np.ndarray) -> Drive:
@@ -28,6 +39,27 @@ def test_whose_a_detection_is() -> None:
         [0, 0, 1, 2], np.ones((4, 3)), box=[[19.0, 0, 41, 10], [0.0, 0, 3, 10], [1.0, 0, 12, 10], [0.0, 0, 10, 10]]
     )
     assert true_objects(seen, drive(np.tile(np.eye(4), (3, 1, 1)))).tolist() == [7, UNKNOWN, 4, -1]
+
+
+class SizeRecorder:
+    """Sees nothing, and remembers how large it was shown the frames."""
+
+    def __init__(self, nothing: ObjectPosteriors) -> None:
+        self.nothing, self.sizes = nothing, []
+
+    def observe(self, images: list, intrinsics: np.ndarray, size: int, **options: object) -> list[ObjectPosteriors]:
+        self.sizes.append(size)
+        return [self.nothing] * len(images)
+
+
+@pytest.mark.parametrize(("zoom", "size"), [(1.0, 256), (1.5, 384), (2.0, 512)])
+def test_frames_are_seen_as_large_as_what_was_learnt_from(zoom: float, size: int) -> None:
+    made = replace(drive(np.tile(np.eye(4), (20, 1, 1))), images=np.zeros((20, 128, 256, 3), np.uint8))
+    nothing = nolbo_ppl.load("tiny").observe(np.full((64, 64, 3), 128, np.uint8), decode=False)
+    assert len(nothing) == 0
+    recorder = SizeRecorder(nothing)
+    assert len(observe_drive(recorder, made, zoom, batch=16)) == 0
+    assert recorder.sizes == [size, size]
 
 
 def test_the_odometry_of_a_drive() -> None:

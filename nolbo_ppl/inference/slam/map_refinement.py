@@ -25,7 +25,7 @@ from nolbo_ppl.inference.slam.initialise import (
 )
 from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.loop_candidates import Pairs, candidate_pairs, posterior_samples
-from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry, settle_odometry
+from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry, settle_odometry, warn_of_contradiction
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
 from nolbo_ppl.inference.slam.slam_state import object_log_density
 
@@ -194,7 +194,7 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     if len(state.rows):
         state = fit_odometry(state)
         state, factors = settle_odometry(state)
-        state = solve_settled(state, factors)
+        state = warn_of_contradiction(solve_settled(state, factors))
     final, found = reassociate(state, rng)
     for _ in range(3):  # landmarks that lost what placed them are no part of the answer
         if not len(found.existence) or np.bincount(found.landmark, found.weight, minlength=len(found.existence)).min() >= 0.5:

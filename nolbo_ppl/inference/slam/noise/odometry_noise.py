@@ -31,6 +31,8 @@ MIN_SUPPORT = 2.0
 """A correction of the odometry must gain as much log evidence over an odometry without noise, nats."""
 NO_NOISE = 1 / 64
 """Factor on the default scales that stands for an odometry without noise."""
+WORTHLESS = 0.45
+"""Scale over the length of the steps from which on a warning says that the detections contradict the odometry."""
 WELL_STATED = 30.0
 """Steps' worth of information below which a scale nobody stated is called a guess."""
 
@@ -243,6 +245,26 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
         )
         state = replace(state, noise=replace(state.noise, report=report, warnings=tuple(dict.fromkeys(warnings))))
     return state, choices[chosen]
+
+
+def warn_of_contradiction(state: SlamState) -> SlamState:
+    """The state with a warning where the scale found for the odometry's translations is as long as its steps.
+
+    So it is when odometry is lost, and when detections are taken for other objects than they are of, or are seen nearer or
+    farther than they are all along: then the map follows them and leaves the odometry.
+    """
+    step = np.diff(state.problem.odometry[:, :3, 3], axis=0)
+    if not len(step) or not len(state.rows):
+        return state
+    length, scale = float(np.median(np.linalg.norm(step, axis=1))), float(np.median(state.noise.translation_step))
+    if length <= 0 or scale <= WORTHLESS * length:
+        return state
+    text = (
+        f"detections contradict the odometry: its steps of {length:.3g} m are taken to err by {scale:.3g} m each. Is it lost, or "
+        "are the detections poor (very small objects, the wrong camera)? Stated scales (odometry_translation_scale) with "
+        "correct_scales=False keep it"
+    )
+    return replace(state, noise=replace(state.noise, warnings=(*state.noise.warnings, text)))
 
 
 def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState:
