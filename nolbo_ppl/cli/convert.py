@@ -14,6 +14,7 @@ import tyro
 from nolbo_ppl.cli.convert_archives import Bop, Coco, ObjectNet3d, Pascal3d, Pix3d, StanfordCars, Voc
 from nolbo_ppl.data.converters import (
     Converted,
+    convert_kitti_drive,
     convert_kitti_object,
     convert_kitti_poles,
     convert_kitti_tracking,
@@ -47,6 +48,25 @@ class KittiObject:
     def write(self) -> str:
         """Run it and say what was written."""
         counts = convert_kitti_object(self.data, self.out)
+        return f"{counts['images']} images, {counts['objects']} cars, {counts['ignore']} regions to ignore"
+
+
+@dataclass(frozen=True)
+class KittiDrive:
+    """Frames of a drive with labels by track (KITTI tracking), as scenes for `nolbo evaluate`."""
+
+    images: Path
+    """Folder of the frames, in the order of their names."""
+    labels: Path
+    """File of labels that begin with frame and track (`labels/0000.txt`)."""
+    calib: Path
+    """File with the projection of camera 2 (`calib/0000.txt`)."""
+    out: Path
+    """Folder for images/, scenes.jsonl, source.json."""
+
+    def write(self) -> str:
+        """Run it and say what was written."""
+        counts = convert_kitti_drive(self.images, self.labels, self.calib, self.out)
         return f"{counts['images']} images, {counts['objects']} cars, {counts['ignore']} regions to ignore"
 
 
@@ -245,6 +265,7 @@ class ForeignFile:
 Source = (
     Annotated[ForeignFile, tyro.conf.subcommand("detections")]
     | Annotated[KittiObject, tyro.conf.subcommand("kitti-object")]
+    | Annotated[KittiDrive, tyro.conf.subcommand("kitti-drive")]
     | Annotated[KittiPoles, tyro.conf.subcommand("kitti-poles")]
     | Annotated[KittiTracking, tyro.conf.subcommand("kitti-tracking")]
     | Annotated[Photographs, tyro.conf.subcommand("photographs")]
@@ -274,7 +295,10 @@ def main(args: list[str] | None = None) -> None:
     """Command line of `nolbo convert`."""
     source: Any = tyro.cli(Source, prog="nolbo convert", args=args)  # type: ignore[arg-type]
     names = SCENES if hasattr(source, "write") and not isinstance(source, ForeignFile) else DRIVE
-    inputs = [getattr(source, name, None) for name in ("data", "images", "intrinsics", "names", "heights", "odometry")]
+    inputs = [
+        getattr(source, name, None)
+        for name in ("data", "images", "intrinsics", "names", "heights", "odometry", "labels", "calib")
+    ]
     with output_folder(source.out, names, is_own=is_converted, inputs=inputs) as folder:
         if hasattr(source, "write"):
             written = dataclasses.replace(source, out=folder).write()

@@ -12,6 +12,9 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 
+COLOUR_MIDDLE, COLOUR_SCALE = 127.5, 64.0
+"""Colours of 0..255 less the one and over the other are what encoders see."""
+
 
 class ConvUnit(nn.Sequential):
     """Convolution, batch normalisation, leaky ReLU."""
@@ -139,4 +142,4 @@ def check_image(image: Tensor) -> None:
 
 def normalise_image(image: Tensor, dtype: torch.dtype) -> Float[Tensor, "b 3 h w"]:
     """Colours from 0..255 to about unit variance about zero."""
-    return (image.to(dtype) - 127.5) / 64.0
+    return (image.to(dtype) - COLOUR_MIDDLE) / COLOUR_SCALE

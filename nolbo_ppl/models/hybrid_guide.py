@@ -3,7 +3,8 @@
 One amortised posterior with the sites of every guide. The image goes once through a frozen detector and, at half its size,
 through the guide's own encoder and head; their predictions are evidence about the same regions (`evidence`). Objects are then
 cut out at one size and sent through encoder, head and RoI refinement again (`crops`): viewpoint, shape and range come from
-there, category from both.
+there, category from both. In evaluation mode the mirror image of each object is looked at too: the azimuth's posterior is the
+mean of both.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from torch import Tensor
 from nolbo_ppl.geometry.boxes import box_area, box_iou
 from nolbo_ppl.models.backbones import check_image, normalise_image
 from nolbo_ppl.models.category_sizes import CategorySizes
-from nolbo_ppl.models.crops import SIDE, cut_out_detailed, image_levels, range_shift
+from nolbo_ppl.models.crops import SIDE, Crops, brightened, cut_out_detailed, image_levels, range_shift, with_mirrored
 from nolbo_ppl.models.evidence import ROLE_SIDE, Evidence, Fused, Fusion, detector_evidence, gather_evidence
 from nolbo_ppl.models.guide import Guide
 from nolbo_ppl.models.image_shift import ImageShift
@@ -140,8 +141,14 @@ class HybridGuide(Guide):
     ) -> RegionParameters:
         """Posterior parameters of given regions; see `Guide.parameters_at`."""
         assert isinstance(encoding, HybridEncoding)
-        raw = self._look(encoding, row, region, look, box)
-        return self.head.parameters_of(raw, self._prior().label_mean())
+        raw, mirror = self._look(encoding, row, region, look, box)
+        return self._parameters_of(raw, mirror)
+
+    def _parameters_of(self, raw: Float[Tensor, "*n outputs"], mirror: Float[Tensor, "*n outputs"] | None) -> RegionParameters:
+        """Posterior parameters of raw outputs, and of those of the mirror images where they were looked at."""
+        prior_mean = self._prior().label_mean()
+        q = self.head.parameters_of(raw, prior_mean)
+        return q if mirror is None else q.with_mirrored(self.head.parameters_of(mirror, prior_mean))
 
     def _look(
         self,
@@ -150,8 +157,9 @@ class HybridGuide(Guide):
         region: Int[Tensor, " n"],
         look: bool = True,
         box: Float[Tensor, "n 4"] | None = None,
-    ) -> Float[Tensor, "n outputs"]:
-        """Raw outputs of regions: of the RoI refinement, with category and box of the evidence."""
+    ) -> tuple[Float[Tensor, "n outputs"], Float[Tensor, "n outputs"] | None]:
+        """Raw outputs of regions: of the RoI refinement, with category and box of the evidence; and, in evaluation mode, those
+        of the mirror images, of which the azimuth alone is taken."""
         fused, dtype = encoding.fused, encoding.objectness_logit.dtype
         assert fused is not None and encoding.box is not None
         labels = fused.label_logits[row, region]
@@ -160,14 +168,18 @@ class HybridGuide(Guide):
         first = sum(self.head.sizes[:4])
         if not look or len(row) == 0:
             start = self.head.get_buffer("start")[-1].to(dtype).expand(len(row), -1)
-            return torch.cat((labels, start[:, label_size:first], located, start[:, first + box_size :]), -1)
+            raw = torch.cat((labels, start[:, label_size:first], located, start[:, first + box_size :]), -1)
+            return raw, None if self.training else raw
         place = encoding.box[row, region] if box is None else box
-        raw, factor = self.look_at(encoding.levels, row, place, encoding.detail)
+        crops = self._crops(encoding.levels, row, place, encoding.detail)
+        factor = crops.factor
+        looks = self._look_into(crops if self.training else with_mirrored(crops)).split(len(row))
+        raw, mirror = looks[0], None if self.training else looks[1]
         shift = range_shift(factor, self.config.range_spread[0])
         ranges = torch.cat((raw[:, first + box_size :][:, :1] + shift[:, None], raw[:, first + box_size + 1 :]), -1)
         seen = fused.look_weight[row, region][:, None] * torch.log_softmax(raw[:, :label_size], -1)
         answer = torch.cat((labels + seen, raw[:, label_size:first], located, ranges), -1)
-        return self.look_at_shapes(answer, encoding, row, place)
+        return self.look_at_shapes(answer, encoding, row, place), mirror
 
     def look_at(
         self,
@@ -178,16 +190,26 @@ class HybridGuide(Guide):
     ) -> tuple[Float[Tensor, "n outputs"], Float[Tensor, " n"]]:
         """Raw outputs of the RoI refinement by boxes, px, cut out of images (`crops.cut_out_detailed`), and pixels of each crop
         over those of its image."""
-        dtype = self.head.objectness.weight.dtype
+        crops = self._crops(levels, row, box, detail)
+        return self._look_into(crops), crops.factor
+
+    @staticmethod
+    def _crops(
+        levels: tuple[Tensor, ...], row: Int[Tensor, " n"], box: Float[Tensor, "n 4"], detail: Float[Tensor, " b"] | None
+    ) -> Crops:
+        """Objects cut out, dark ones brightened."""
         with torch.no_grad():
-            crops = cut_out_detailed(levels, detail, row, box.detach())
-        number, cells = torch.arange(len(row), device=row.device), SIDE // self.config.stride
+            return brightened(cut_out_detailed(levels, detail, row, box.detach()))
+
+    def _look_into(self, crops: Crops) -> Float[Tensor, "n outputs"]:
+        """Raw outputs of the RoI refinement of crops."""
+        dtype = self.head.objectness.weight.dtype
+        number, cells = torch.arange(len(crops.box), device=crops.box.device), SIDE // self.config.stride
         cell = torch.full_like(number, (cells * cells) // 2)
         with self._autocast():
             maps, fine = self.encoder(crops.image)
             raw = self.head(maps[:, :, cells // 2, cells // 2])[:, -1]
-            raw = self.head.refine(raw.to(dtype), fine, number, cell, cells, crops.box).to(dtype)
-        return raw, crops.factor
+            return self.head.refine(raw.to(dtype), fine, number, cell, cells, crops.box).to(dtype)
 
     def responsible_region(self, encoding: Encoding, row: Int[Tensor, " n"], box: Float[Tensor, "n 4"]) -> Int[Tensor, " n"]:
         """Region that describes each box best: the largest overlap, the likelier of like ones."""
@@ -226,9 +248,10 @@ class HybridGuide(Guide):
             at = region[row, slot]
             found = overlap[row, slot] >= SAME_OBJECT  # where an object is not found, the look is taken where it is
             box = torch.where(found[:, None], encoding.box[row, at], batch.box[row, slot])
-        raw = self.head.get_buffer("start")[-1].to(encoding.objectness_logit).expand(*region.shape, -1)
-        raw = raw.index_put((row, slot), self._look(encoding, row, at, True, box))
-        posterior = self.head.parameters_of(raw, self._prior().label_mean())
+        start = self.head.get_buffer("start")[-1].to(encoding.objectness_logit).expand(*region.shape, -1)
+        raw, mirror = self._look(encoding, row, at, True, box)
+        mirror = None if mirror is None else start.index_put((row, slot), mirror)
+        posterior = self._parameters_of(start.index_put((row, slot), raw), mirror)
         return ObservedScene(batch, encoding, assignment, posterior)
 
 

@@ -89,6 +89,13 @@ class RegionParameters:
         shift = (likeliest - probability) @ prior_mean.to(probability.dtype)
         return dataclasses.replace(self, shape_loc=self.shape_loc + shift)
 
+    def with_mirrored(self, mirrored: RegionParameters) -> RegionParameters:
+        """The same with the azimuth's posterior averaged with what the mirror image of each region says of it."""
+        logits = torch.cat((torch.log_softmax(self.azimuth_logits, -1), torch.log_softmax(mirrored.azimuth_logits, -1)), -1)
+        turned = mirrored.azimuth_natural * mirrored.azimuth_natural.new_tensor([1.0, -1.0])
+        natural = torch.cat((self.azimuth_natural, turned), -2)
+        return dataclasses.replace(self, azimuth_logits=logits, azimuth_natural=natural)
+
     def widened(self, factor: Float[Tensor, "*n"]) -> RegionParameters:
         """The same with every scale this many times as large, categories as much less certain."""
         by = factor[..., None]

@@ -9,7 +9,9 @@ import torch
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.elbo import INCLUSIVE, SceneELBO, SceneLoss
-from nolbo_ppl.models.crops import BOX_SIDE, SIDE, cut_out, image_levels
+from nolbo_ppl.models.backbones import COLOUR_MIDDLE, COLOUR_SCALE
+from nolbo_ppl.models.crops import BOX_SIDE, MIDDLE, SIDE, Crops, brightened, cut_out, image_levels, with_mirrored
+from nolbo_ppl.models.distributions import VonMisesMixture
 from nolbo_ppl.models.evidence import COCO_LABELS, MIN_LOG, ROLE_SIDE, WEAK, bin_best, detector_evidence
 from nolbo_ppl.models.hybrid_guide import HybridGuide, assign_regions, known_regions
 from nolbo_ppl.models.observation_model import Nolbo
@@ -111,6 +113,52 @@ def test_objects_are_cut_out_at_one_size() -> None:
         across = centre[0] + step / crops.factor[k]
         inside = (across > 8) & (across < 184)  # beyond the border its last pixel goes on
         torch.testing.assert_close(crops.image[k, 0, SIDE // 2, inside], across[inside], atol=0.05, rtol=0)
+
+
+def test_dark_objects_are_brightened() -> None:
+    """An even box comes to the wanted mean whatever lies around it, black to one as much brighter as can be; bright ones stay."""
+    colours = torch.tensor([0.12, 0.3, 0.45, 0.8, 1e-3])
+    box = torch.tensor([[20.0, 30, 60, 80]]).expand(5, 4)
+    light = torch.full((5, 3, SIDE, SIDE), 0.99)
+    light[:, :, 30:80, 20:60] = colours[:, None, None, None]
+    crops = Crops((255 * light - COLOUR_MIDDLE) / COLOUR_SCALE, box, torch.ones(5))
+    seen = (brightened(crops).image * COLOUR_SCALE + COLOUR_MIDDLE) / 255
+    inside = seen[:, :, 30:80, 20:60].mean((1, 2, 3))
+    torch.testing.assert_close(inside, torch.tensor([MIDDLE, MIDDLE, 0.45, 0.8, 0.1]))
+    torch.testing.assert_close(seen[2:4], light[2:4])
+    assert (seen[0, :, :20] > 0.99).all() and (seen <= 1).all()  # surroundings keep their order and are not cut off
+
+
+def test_the_azimuth_of_a_mirrored_picture_is_the_negative() -> None:
+    """A guide that looks at both says of the mirror image exactly the opposite of what it says of the image."""
+    guide = guide_of(hybrid(3)).eval()
+    image = random_batch(CONFIG, scenes=1, slots=1).image
+    width = image.shape[-1]
+    box = torch.tensor([[20.0, 12, 50, 44]])
+    turned = torch.stack((width - box[:, 2], box[:, 1], width - box[:, 0], box[:, 3]), -1)
+    row, region = torch.tensor([0]), torch.tensor([3])
+    angles = torch.linspace(-3, 3, 25)[:, None]
+
+    def density(picture: torch.Tensor, place: torch.Tensor, q_of: HybridGuide) -> torch.Tensor:
+        with torch.no_grad():
+            q = q_of.parameters_at(q_of.encode(picture), row, region, box=place)
+        return VonMisesMixture(q.azimuth_logits, q.azimuth_natural, max_concentration=300.0).log_prob(angles)
+
+    here, there = density(image, box, guide), density(image.flip(-1), turned, guide)
+    torch.testing.assert_close(here, there.flip(0))
+    guide.training = True  # one look alone
+    one, other = density(image, box, guide), density(image.flip(-1), turned, guide)
+    assert (one - other.flip(0)).abs().max() > 1e-3
+    torch.testing.assert_close(here, torch.logaddexp(one, other.flip(0)) - torch.log(torch.tensor(2.0)))
+
+
+def test_crops_and_their_mirror_images() -> None:
+    g = torch.Generator().manual_seed(8)
+    crops = Crops(torch.randn(2, 3, SIDE, SIDE, generator=g), torch.tensor([[10.0, 20, 30, 50], [5, 6, 90, 100]]), torch.ones(2))
+    both = with_mirrored(crops)
+    assert len(both.box) == 4 and torch.equal(both.image[:2], crops.image) and torch.equal(both.box[:2], crops.box)
+    assert torch.equal(both.image[2, :, 20:50, SIDE - 30 : SIDE - 10], crops.image[0, :, 20:50, 10:30].flip(-1))
+    assert both.box[2].tolist() == [SIDE - 30, 20, SIDE - 10, 50]
 
 
 def test_range_of_a_crop_is_that_of_the_image() -> None:

@@ -8,6 +8,7 @@ object is a mistake.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -231,7 +232,7 @@ def convert_kitti_object(data: str | PathLike[str], out: str | PathLike[str]) ->
     Raises:
         InputError: files are missing or malformed.
     """
-    folder, out = Path(data), Path(out)
+    folder = Path(data)
     pictures = existing(folder / "image_2", "images of KITTI")
     images = images_of(pictures)
     rows, cameras = [], {}
@@ -239,6 +240,40 @@ def convert_kitti_object(data: str | PathLike[str], out: str | PathLike[str]) ->
         labels = read_object_labels(existing(folder / "label_2" / f"{path.stem}.txt", "labels"))
         camera, cameras[path.name] = camera_of_image(folder / "calib" / f"{path.stem}.txt", labels)
         rows.append(scene_row(f"images/{path.name}", labels, camera, *image_size(path)))
+    return _write(images, rows, Path(out), {"kind": "kitti-object", "calibration": cameras})
+
+
+def convert_kitti_drive(
+    images: str | PathLike[str], labels: str | PathLike[str], calib: str | PathLike[str], out: str | PathLike[str]
+) -> dict[str, Any]:
+    """Write the frames of a drive and its labels by track (KITTI tracking) as a folder of scenes.
+
+    Args:
+        images: folder of the drive's frames, in the order of their names.
+        labels: file of labels that begin with frame and track.
+        calib: file with the projection of camera 2.
+        out: folder for `images/`, `scenes.jsonl` and `source.json`.
+
+    Returns:
+        Numbers of images, objects and regions to ignore.
+
+    Raises:
+        InputError: files are missing or malformed, or a label is of a frame that has no image.
+    """
+    pictures, camera = images_of(existing(Path(images), "frames of a drive")), read_calibration(calib)
+    frames = read_track_labels(labels)
+    if len(frames) > len(pictures):
+        raise input_error("labels of a drive", got=f"frame {len(frames) - 1}", expected=f"below {len(pictures)}", file=labels)
+    frames += [[]] * (len(pictures) - len(frames))
+    rows = [
+        scene_row(f"images/{path.name}", [label for _, label in frame], camera, *image_size(path))
+        for path, frame in zip(pictures, frames)
+    ]
+    return _write(pictures, rows, Path(out), {"kind": "kitti-drive"})
+
+
+def _write(images: Sequence[Path], rows: list[dict[str, Any]], out: Path, source: dict[str, Any]) -> dict[str, Any]:
+    """Images and labels as a folder of scenes; how many there are."""
     for path in images:
         with atomic_path(out / "images" / path.name) as temporary:
             shutil.copyfile(path, temporary)
@@ -248,5 +283,5 @@ def convert_kitti_object(data: str | PathLike[str], out: str | PathLike[str]) ->
         "objects": sum(len(row["objects"]) for row in rows),
         "ignore": sum(len(row["ignore"]) for row in rows),
     }
-    write_json(out / "source.json", {"kind": "kitti-object", **counts, "calibration": cameras})
+    write_json(out / "source.json", {**source, **counts})
     return counts

@@ -15,6 +15,7 @@ from nolbo_ppl.data.converters.kitti_object import (
     CAMERAS,
     IGNORED,
     KittiLabel,
+    convert_kitti_drive,
     convert_kitti_object,
     likeliest_camera,
     projected_box,
@@ -60,6 +61,26 @@ def test_a_car_by_hand(tmp_path: Path) -> None:
     assert car["box"] == [100.5, 50.5, 199.5, 119.5]
     assert car["visibility"] == pytest.approx(0.75 * 0.75)
     assert car["category"] == "car" and car["symmetry"] == 1
+
+
+def test_frames_of_a_drive(tmp_path: Path) -> None:
+    """Each frame has the labels that name its number, the same as an image of its own; a frame nobody labelled has none."""
+    one = converted(tmp_path, CAR.format(ry="0.30"))
+    drive = tmp_path / "drive"
+    (drive / "frames").mkdir(parents=True)
+    for number in range(3):
+        Image.fromarray(np.full((120, 200, 3), number, dtype=np.uint8)).save(drive / "frames" / f"{number:010d}.png")
+    (drive / "0000.txt").write_text(f"1 7 {CAR.format(ry='0.30')}\n0 -1 {REGION}\n")
+    (drive / "calib.txt").write_text(CALIB)
+    options = ["--images", str(drive / "frames"), "--labels", str(drive / "0000.txt"), "--calib", str(drive / "calib.txt")]
+    main(["kitti-drive", *options, "--out", str(tmp_path / "scenes")])
+    rows = [json.loads(line) for line in (tmp_path / "scenes" / "scenes.jsonl").read_text().splitlines()]
+    assert [len(row["objects"]) for row in rows] == [0, 1, 0] and [len(row["ignore"]) for row in rows] == [1, 0, 0]
+    assert rows[1]["objects"] == one["objects"] and rows[1]["intrinsics"] == one["intrinsics"]
+    assert len(SceneFolder(tmp_path / "scenes")) == 3
+    (drive / "0000.txt").write_text(f"3 7 {CAR.format(ry='0.30')}\n")
+    with pytest.raises(InputError, match="labels of a drive"):
+        convert_kitti_drive(drive / "frames", drive / "0000.txt", drive / "calib.txt", tmp_path / "again")
 
 
 @pytest.mark.parametrize(("rotation_y", "front"), [(0.0, [1, 0, 0]), (-math.pi / 2, [0, 0, 1]), (math.pi / 2, [0, 0, -1])])
