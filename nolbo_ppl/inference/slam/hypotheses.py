@@ -4,7 +4,9 @@ The first run anneals from the odometry. The second begins with the best whole a
 (`best_associations`), which is searched for quite otherwise, or with a wider drift where the odometry's scales are guesses. Where
 the two agree, only associations that come near the best have a run too; else up to `SlamConfig.hypotheses` runs: which loops an
 annealed run closes can depend on its samples and on how wide a drift it begins with, so further ones differ in both, and the next
-best associations have their turns. Runs that end at one trajectory are one hypothesis; weights are the shares of the evidence.
+best associations have their turns. Where a run left the odometry far behind what was said of it, one that keeps it competes with
+it: wrong associations want loose odometry, and loose odometry lets wrong associations be. Runs that end at one trajectory are
+one hypothesis; weights are the shares of the evidence.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
 from nolbo_ppl.inference.slam.map_refinement import finish
+from nolbo_ppl.inference.slam.noise.noise_estimation import step_sigmas
 from nolbo_ppl.inference.slam.noise.odometry_noise import stated_sigmas
 from nolbo_ppl.inference.slam.shared_errors import linearise_answer
 from nolbo_ppl.inference.slam.slam_state import SlamState
@@ -43,6 +46,8 @@ AMBIGUOUS = 0.05
 """A rival with more weight than this makes the answer ambiguous."""
 RAISED = 3.0
 """Stated scales of the odometry raised by more than this at the end of a run: it is repeated from its start."""
+LEFT_BEHIND = 2.0
+"""Scales of the odometry this many times the stated or the default ones at the end of a run have a rival that keeps those."""
 MIN_WEIGHT = 1e-4
 """Hypotheses of less weight are not kept."""
 
@@ -124,6 +129,38 @@ def raised_odometry(start: SlamState, end: SlamState) -> SlamState | None:
     return replace(start, noise=noise)
 
 
+def with_odometry_kept(start: SlamState, end: SlamState) -> SlamState | None:
+    """The start with the odometry's scales as stated, or the default ones, for good; None where the end is not far above them.
+
+    A detector whose errors are wrongly stated (objects smaller than it learnt from, say) contradicts the odometry step after
+    step. Which of the two errs is then asked of the evidence of the whole map: in a drive of 494 frames seen at half the size
+    that the network learnt from, stated scales were raised 15-fold and 8.3 m of error became 94 m, with a log evidence of 6 557;
+    kept, the same detections gave 4.7 m and 9 107.
+    """
+    if not len(start.noise.rotation_step):
+        return None
+    rotation, translation, _ = step_sigmas(start.problem, start.config)
+    ratios = np.median(end.noise.rotation_step / rotation), np.median(end.noise.translation_step / translation)
+    if max(ratios) < LEFT_BEHIND:
+        return None
+    report = {name: value for name, value in start.noise.report.items() if not name.startswith("odometry_")}
+    report |= {"odometry_rotation_scale": float(np.median(rotation)), "odometry_translation_scale": float(np.median(translation))}
+    noise = replace(start.noise, rotation_step=rotation, translation_step=translation, report=report)
+    return replace(start, noise=noise, odometry_kept=True)
+
+
+def told_of_kept(state: SlamState, other: Run) -> SlamState:
+    """The state with a warning that its odometry was kept against another run, in whose map it errs far more."""
+    ratio = float(np.median(other.state.noise.translation_step / state.noise.translation_step))
+    turned = float(np.median(other.state.noise.rotation_step / state.noise.rotation_step))
+    text = (
+        f"detections contradict the odometry: they would have its scales {ratio:.3g} (translation) and {turned:.3g} (rotation) "
+        "times as large, but the map as a whole is more probable with the odometry kept. Are the detections poor (very small "
+        "objects, the wrong camera)?"
+    )
+    return replace(state, noise=replace(state.noise, warnings=(*state.noise.warnings, text)))
+
+
 def run_to_end(
     state: SlamState,
     iterate: Callable[[SlamState, Callable[[SlamState, EmStepInfo], None]], tuple[SlamState, tuple[EmStepInfo, ...]]],
@@ -191,11 +228,16 @@ def explore(
     runs: list[Run] = []
     same = SAME_MAP * 2 * state.link_scale
     limit = max(state.config.hypotheses, 1)
+    given = state
     runs.append(run_to_end(state, iterate, on_step))
     if (raised := raised_odometry(state, runs[0].state)) is not None:
         # Loops were judged under a drift far too small: once more under what the map now says.
         state = raised
         runs[0] = run_to_end(state, iterate, on_step)
+    if (rival := with_odometry_kept(given, runs[0].state)) is not None:
+        kept_run = run_to_end(rival, iterate, on_step)
+        if kept_run.log_evidence > runs[0].log_evidence:
+            state, runs[0] = rival, replace(kept_run, state=told_of_kept(kept_run.state, runs[0]))
     if limit > 1 and len(state.static) > 1:
         associations = best_associations(state, count=limit)
         starts = starts_after_first(state, associations)

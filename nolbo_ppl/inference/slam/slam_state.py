@@ -69,6 +69,9 @@ class SlamState:
     odometry_scale: Float[np.ndarray, " n-1"] | None = None
     """Factors the steps of the given odometry were multiplied by in `problem`, where its scale drifts (`scale_drift`)."""
 
+    odometry_kept: bool = False
+    """The odometry's scales are not fitted: a run that asks what the detections are worth if the odometry is as good as said."""
+
     frame_model: FrameModel | None = None
     """Model of a frame's detections, once the map has been associated."""
 

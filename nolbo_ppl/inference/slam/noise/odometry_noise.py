@@ -197,7 +197,7 @@ def settle_odometry(state: SlamState) -> tuple[SlamState, tuple[float, float]]:
     scale. Where scales are guesses a warning says so, and how far half and twice of them would move the trajectory.
     """
     free = (not stated_sigmas(state.problem, state.config)[0], not stated_sigmas(state.problem, state.config)[1])
-    if len(state.problem) < 3 or not len(state.rows):
+    if len(state.problem) < 3 or not len(state.rows) or state.odometry_kept:
         return state, (1.0, 1.0)
     if not all(free):
         state = raise_stated(state, (not free[0], not free[1]))
@@ -273,7 +273,7 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
     Scales nobody stated go up and down where `MIN_STATED` steps tell them. Stated ones stay unless they are too small by more
     than a third (reported, and raised with `correct_scales`).
     """
-    if len(state.problem) < 3 or not len(state.rows):
+    if len(state.problem) < 3 or not len(state.rows) or state.odometry_kept:
         return state
     report, warnings = dict(state.noise.report), list(state.noise.warnings)
     factors = np.ones(2)
