@@ -7,6 +7,7 @@ labelled shapes; a held-out shape is given the class whose prior N(mu_psi(l), I)
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nolbo_ppl.data.loader import batch_indices
 from nolbo_ppl.data.voxel_archive import VoxelArchive
 from nolbo_ppl.devices import device_of, placed
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.inference import svi as optimisation
-from nolbo_ppl.inference.elbo import SHAPE_STAGE
+from nolbo_ppl.inference.elbo import SHAPE_LABEL, SHAPE_STAGE
 from nolbo_ppl.inference.posterior.decode import category_log_likelihood
 from nolbo_ppl.inference.posterior.decoded_shapes import decode_latents
 from nolbo_ppl.inference.posterior.model_folder import load
@@ -53,10 +53,21 @@ class ShapeVaeConfig:
     """Shapes decoded a step, which stand for all: the decoder costs four times what the encoder does."""
     learning_rate: float = 2e-3
     """Rate after the warm-up; it falls along a cosine over the second half."""
-    shift: int = 1
-    """Shapes are moved by up to so many voxels along every axis."""
-    half_precision: bool = True
-    """Networks in bfloat16."""
+    label_weight: float = 200.0
+    """Weight of the term that keeps classes apart (`shape_label`), beside voxels of a thousand nats and more: after 400 steps on
+    ModelNet10, on shapes kept for such choices, accuracy was 0.85 at a weight of 20, 0.89 at 200, 0.90 without voxels."""
+    balance: float = 0.5
+    """Shapes of a class of n shapes are drawn in proportion to n^-balance: 0 takes all shapes alike, 1 all classes."""
+    mirror: bool = True
+    """Half of the shapes are mirrored, left for right (`augmented`). Mirrored front to back as well, the encoder alone reached
+    0.87 in place of 0.90."""
+    stretch: float = 0.15
+    """Shapes are stretched along every axis by a factor of up to 1 + stretch or its inverse, at the same longest side."""
+    shift: int = 0
+    """Shapes are moved by up to so many voxels along every axis. Where an archive's shapes lie in the middle, as ModelNet10's,
+    the latent would spend itself on places that never come: 2 370 nats of voxels after 400 steps, 2 000 without."""
+    half_precision: bool = False
+    """Networks in bfloat16: on processors without instructions for it a step takes 1.8 times as long."""
     seed: int = 0
     """Seed of weights, order, augmentation and noise."""
     checkpoint_every: int = 200
@@ -78,24 +89,49 @@ class ShapeVaeConfig:
         )
 
 
-def augmented(voxels: Bool[Tensor, "n v v v"], shift: int, generator: torch.Generator) -> Bool[Tensor, "n v v v"]:
-    """Shapes mirrored at random along each of the two horizontal axes, and moved by up to `shift` voxels along every axis.
+def balanced_rows(category: Int[Tensor, " n"], count: int, balance: float, generator: torch.Generator) -> Int[Tensor, " count"]:
+    """Numbers of the shapes of a batch, none twice; a shape of a class of n shapes is drawn in proportion to n^-balance.
 
-    A mirrored shape is another shape of its class. What leaves the grid on one side is lost: no shape may reach the border.
+    Raises:
+        InputError: fewer shapes than are wanted.
     """
-    out = voxels
-    for axis in (1, 2):
-        flip = torch.rand(len(out), generator=generator) < 0.5
-        out = torch.where(flip[:, None, None, None], out.flip(axis), out)
-    if shift:
-        moved = torch.zeros_like(out)
-        offset = torch.randint(-shift, shift + 1, (len(out), 3), generator=generator).tolist()
-        for row, by in enumerate(offset):
-            to = tuple(slice(max(b, 0), out.shape[1] + min(b, 0)) for b in by)
-            of = tuple(slice(max(-b, 0), out.shape[1] + min(-b, 0)) for b in by)
-            moved[row][to] = out[row][of]
-        out = moved
-    return out
+    if count > len(category):
+        raise input_error("shapes of a batch", got=count, expected=f"at most the {len(category)} there are")
+    weight = torch.bincount(category).double().clamp_min(1).pow(-balance)[category]
+    return torch.multinomial(weight, count, replacement=False, generator=generator)
+
+
+def augmented(
+    voxels: Bool[Tensor, "n v v v"], generator: torch.Generator, mirror: bool = True, stretch: float = 0.0, shift: int = 0
+) -> Bool[Tensor, "n v v v"]:
+    """Other shapes of the same classes: mirrored, stretched and moved at random, in voxels of the nearest place.
+
+    Args:
+        voxels: shapes, none empty; the third axis points upwards.
+        generator: of the random numbers.
+        mirror: half of the shapes are mirrored along the horizontal axis that changes them less, left for right. The other
+            one would turn front to back: a set of aligned shapes has no such ones.
+        stretch: factors along the three axes are log-uniform up to 1 + stretch, brought to the shape's longest side.
+        shift: voxels along every axis at most; what leaves the grid is lost.
+    """
+    n, side = len(voxels), voxels.shape[1]
+    chosen = torch.rand(n, 1, generator=generator) < 0.5
+    factor = torch.exp((2 * torch.rand(n, 3, generator=generator) - 1) * math.log1p(stretch))
+    offset = torch.randint(-shift, shift + 1, (n, 3), generator=generator)
+    sign = torch.ones(n, 3)
+    if mirror:
+        same = torch.stack([(voxels & voxels.flip(axis)).flatten(1).sum(1) for axis in (1, 2)], 1)
+        sign.scatter_(1, same.argmax(1, keepdim=True), torch.where(chosen, -1.0, 1.0))
+    flat = voxels.any(3)
+    extent = torch.stack((flat.any(2).sum(1), flat.any(1).sum(1), voxels.any(2).any(1).sum(1)), 1).float()
+    factor = factor * (extent.amax(1) / (extent * factor).amax(1))[:, None]
+    place = torch.arange(side) + 0.5 - side / 2  # of the voxels' centres from the grid's
+    source = (place - offset[..., None]) / factor[..., None] * sign[..., None] + side / 2
+    inside = (source >= 0) & (source < side)
+    x, y, z = source.floor().long().clamp(0, side - 1).unbind(1)
+    in_x, in_y, in_z = inside.unbind(1)
+    out = voxels[torch.arange(n)[:, None, None, None], x[:, :, None, None], y[:, None, :, None], z[:, None, None, :]]
+    return out & in_x[:, :, None, None] & in_y[:, None, :, None] & in_z[:, None, None, :]
 
 
 def fit_shape_vae(
@@ -125,7 +161,8 @@ def fit_shape_vae(
     where = device_of(device)
     model = model.to(where, torch.get_default_dtype())
     schedule = OptimizerConfig(config.steps, config.learning_rate, warmup=min(50, config.steps), clip=5000.0, ema=0.99)
-    run = StageRun(model, TrainingStage("shapes", schedule, SHAPE_STAGE, decode=config.decode), config.half_precision)
+    weights = {**SHAPE_STAGE, SHAPE_LABEL: config.label_weight}
+    run = StageRun(model, TrainingStage("shapes", schedule, weights, decode=config.decode), config.half_precision)
     identity = {**dataclasses.asdict(config), "shapes": len(archive)}
     identity = {name: list(v) if isinstance(v, tuple) else v for name, v in identity.items() if name != "checkpoint_every"}
     if checkpoint is not None and checkpoint.is_file():
@@ -138,9 +175,9 @@ def fit_shape_vae(
     with bar:
         while not run.finished:
             step = run.state.step
-            index = torch.from_numpy(batch_indices(len(archive), config.batch, config.seed, step))
             generator = torch.Generator().manual_seed(config.seed * 1_000_003 + step)
-            shapes = augmented(voxels[index], config.shift, generator)
+            index = balanced_rows(category, min(config.batch, len(archive)), config.balance, generator)
+            shapes = augmented(voxels[index], generator, config.mirror, config.stretch, config.shift)
             noise = seeded_noise(config.seed, step, len(index), config.latent_dim).to(torch.get_default_dtype())
             batch = ShapeBatch(pack_bits(shapes), category[index], torch.full((len(index),), -1), noise)
             info = run.step(placed(batch, where))

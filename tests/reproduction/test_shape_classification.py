@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,13 @@ from nolbo_ppl.inference.elbo import SceneELBO
 from nolbo_ppl.metrics.voxel import voxel_iou
 from nolbo_ppl.models.scene_batch import pack_bits
 from nolbo_ppl.models.shape_vae import ShapeBatch
-from nolbo_ppl.reproduction.shape_classification import ShapeVaeConfig, augmented, fit_shape_vae, score_shapes
+from nolbo_ppl.reproduction.shape_classification import (
+    ShapeVaeConfig,
+    augmented,
+    balanced_rows,
+    fit_shape_vae,
+    score_shapes,
+)
 from tests.factories import random_batch, tiny_config, tiny_model
 
 
@@ -35,22 +42,77 @@ def posts_and_slabs(count: int) -> VoxelArchive:
     return VoxelArchive(voxels, np.arange(count) % 2, ("slab", "post"))
 
 
+def chairs(count: int) -> torch.Tensor:
+    """Seats with a back at one end of the second axis and an arm on one side, of random sizes, in the middle of the grid."""
+    rng = np.random.default_rng(0)
+    voxels = torch.zeros(count, 32, 32, 32, dtype=torch.bool)
+    for shape in voxels:
+        width, depth, height = (int(k) for k in rng.integers(6, 13, 3))
+        box = shape[16 - width : 16 + width, 16 - depth : 16 + depth, 16 - height : 16 + height]
+        box[:, :, :4] = True
+        box[:, :3] = True
+        box[:2, :, :9] = True
+    return voxels
+
+
+def sides(voxels: torch.Tensor) -> torch.Tensor:
+    """Extents along the three axes."""
+    return torch.stack([voxels.any(b + 1).any(a + 1).sum(1) for a, b in ((1, 2), (0, 2), (0, 1))], 1)
+
+
 def test_augmented_shapes() -> None:
-    """Nothing is lost, up stays up, and each of the four mirror images comes."""
-    voxels = torch.zeros(200, 32, 32, 32, dtype=torch.bool)
+    """Nothing is lost, up stays up, the back stays at the back, the arm is on either side."""
+    voxels = chairs(200)
+    out = augmented(voxels, torch.Generator().manual_seed(0))
+    flipped = (out == voxels.flip(1)).flatten(1).all(1)
+    assert (flipped | (out == voxels).flatten(1).all(1)).all()
+    assert abs(float(flipped.float().mean()) - 0.5) < 5 * (0.25 / 200) ** 0.5
+    assert torch.equal(augmented(voxels, torch.Generator().manual_seed(0)), out)
+    assert torch.equal(augmented(voxels, torch.Generator().manual_seed(0), mirror=False), voxels)
+
+
+def test_stretched_shapes_keep_class_and_volume() -> None:
+    """The longest side stays, others change by the stated factors at most, and volume with them; so do all proportions."""
+    voxels = chairs(100)
+    out = augmented(voxels, torch.Generator().manual_seed(1), mirror=False, stretch=0.2)
+    before, after = sides(voxels), sides(out)
+    assert (after.amax(1) - before.amax(1)).abs().max() <= 1
+    ratio = after / before
+    assert (ratio < 1.2**2 * 1.1).all() and (ratio > 1.2**-2 / 1.1).all()
+    assert float(ratio.std()) > 0.05
+    volume = out.flatten(1).sum(1) / voxels.flatten(1).sum(1)
+    assert (volume / ratio.prod(1)).sub(1).abs().max() < 0.35 and abs(float(volume.mean()) - 1) < 0.2
+    assert torch.equal(out.flatten(1).sum(1) > 0, torch.ones(100, dtype=torch.bool))
+    # back and seat lie where they lay
+    assert (out.float().mean((1, 3)).argmax(1) < 16).all() and (out.float().mean((1, 2)).argmax(1) < 16).all()
+
+
+def test_moved_shapes() -> None:
+    """One voxel along every axis at most, each of the 27 places, and nothing is lost."""
+    voxels = torch.zeros(400, 32, 32, 32, dtype=torch.bool)
     voxels[:, 10, 12, 5] = True
-    out = augmented(voxels, 1, torch.Generator().manual_seed(0))
-    assert (out.flatten(1).sum(1) == 1).all()
-    place = out.nonzero()[:, 1:]
-    assert set(place[:, 2].tolist()) == {4, 5, 6}
-    near = {(x, y) for x in (10, 21) for y in (12, 19)}
-    seen = {min(near, key=lambda c: abs(c[0] - x) + abs(c[1] - y)) for x, y, _ in place.tolist()}
-    assert seen == near
-    assert torch.equal(augmented(voxels, 1, torch.Generator().manual_seed(0)), out)
+    out = augmented(voxels, torch.Generator().manual_seed(0), mirror=False, shift=1)
+    place = out.nonzero()
+    assert torch.equal(place[:, 0], torch.arange(400))
+    assert {tuple(row) for row in (place[:, 1:] - torch.tensor([10, 12, 5])).tolist()} == set(product((-1, 0, 1), repeat=3))
+
+
+@pytest.mark.parametrize(("balance", "power"), [(0.0, 1.0), (0.5, 0.5), (1.0, 0.0)])
+def test_balanced_batches(balance: float, power: float) -> None:
+    """Classes of 1800 and 200 shapes come in proportion to n^(1 - balance); no shape comes twice."""
+    category = (torch.arange(2000) >= 1800).long()
+    generator = torch.Generator().manual_seed(0)
+    rows = [balanced_rows(category, 8, balance, generator) for _ in range(500)]
+    assert all(len(set(row.tolist())) == 8 for row in rows)
+    share = float(category[torch.cat(rows)].float().mean())
+    expected = 200**power / (200**power + 1800**power)
+    assert abs(share - expected) < 5 * (expected * (1 - expected) / 4000) ** 0.5
+    with pytest.raises(InputError, match="shapes of a batch"):
+        balanced_rows(category[:3], 4, balance, generator)
 
 
 def test_two_kinds_of_shapes_are_told_apart(tmp_path: Path) -> None:
-    config = ShapeVaeConfig(steps=16, batch=8, decode=2, shift=0, half_precision=False)
+    config = ShapeVaeConfig(steps=16, batch=8, decode=2)
     archive = posts_and_slabs(24)
     losses: list[float] = []
     model = fit_shape_vae(archive, config, tmp_path / "a.safetensors", lambda info: losses.append(info.loss))
@@ -65,7 +127,7 @@ def test_two_kinds_of_shapes_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_a_killed_fit_goes_on_bit_for_bit(tmp_path: Path) -> None:
-    config = ShapeVaeConfig(steps=4, batch=4, decode=2, half_precision=False, checkpoint_every=1)
+    config = ShapeVaeConfig(steps=4, batch=4, decode=2, shift=1, checkpoint_every=1)
     archive = posts_and_slabs(6)
     whole = fit_shape_vae(archive, config)
 
