@@ -46,7 +46,7 @@ class Budget:
 
 BUDGETS: dict[BudgetName, Budget] = {
     "smoke": Budget(24, 12, 2, 2, 4, 64, 64, 40, 2.0, (128, 64), 3, 2, 30),
-    "small": Budget(1024, 192, 120, 160, 16, 128, 192, 600, 2.5, (256, 128), 1500, 5, 100),
+    "small": Budget(1024, 192, 120, 160, 16, 128, 192, 600, 2.5, (256, 128), 1600, 5, 100),
     "full": Budget(16384, 1024, 1200, 4000, 64, 128, 256, 4600, 1.0, (384, 192), 6000, 50, 800),
 }
 """By name: a few seconds for tests, minutes a network on two cores, and what the shipped weights were trained with."""
