@@ -47,7 +47,7 @@ AMBIGUOUS = 0.05
 RAISED = 3.0
 """Stated scales of the odometry raised by more than this at the end of a run: it is repeated from its start."""
 LEFT_BEHIND = 2.0
-"""Scales of the odometry this many times the stated or the default ones at the end of a run have a rival that keeps those."""
+"""A scale of translations so many times the stated or the default one at the end of a run has a rival that keeps that."""
 MIN_WEIGHT = 1e-4
 """Hypotheses of less weight are not kept."""
 
@@ -130,7 +130,9 @@ def raised_odometry(start: SlamState, end: SlamState) -> SlamState | None:
 
 
 def with_odometry_kept(start: SlamState, end: SlamState) -> SlamState | None:
-    """The start with the odometry's scales as stated, or the default ones, for good; None where the end is not far above them.
+    """The start with the scale of translations as stated, or the default one, for good; None where the end is not far above it.
+
+    That of rotations is the stated one, or what the end found: bearings tell it, and ranges do not bend them.
 
     A detector whose errors are wrongly stated (objects smaller than it learnt from, say) contradicts the odometry step after
     step. Which of the two errs is then asked of the evidence of the whole map: in a drive of 494 frames seen at half the size
@@ -140,9 +142,10 @@ def with_odometry_kept(start: SlamState, end: SlamState) -> SlamState | None:
     if not len(start.noise.rotation_step):
         return None
     rotation, translation, _ = step_sigmas(start.problem, start.config)
-    ratios = np.median(end.noise.rotation_step / rotation), np.median(end.noise.translation_step / translation)
-    if max(ratios) < LEFT_BEHIND:
+    if float(np.median(end.noise.translation_step / translation)) < LEFT_BEHIND:
         return None
+    if not stated_sigmas(start.problem, start.config)[0]:
+        rotation = end.noise.rotation_step
     report = {name: value for name, value in start.noise.report.items() if not name.startswith("odometry_")}
     report |= {"odometry_rotation_scale": float(np.median(rotation)), "odometry_translation_scale": float(np.median(translation))}
     noise = replace(start.noise, rotation_step=rotation, translation_step=translation, report=report)
@@ -152,11 +155,9 @@ def with_odometry_kept(start: SlamState, end: SlamState) -> SlamState | None:
 def told_of_kept(state: SlamState, other: Run) -> SlamState:
     """The state with a warning that its odometry was kept against another run, in whose map it errs far more."""
     ratio = float(np.median(other.state.noise.translation_step / state.noise.translation_step))
-    turned = float(np.median(other.state.noise.rotation_step / state.noise.rotation_step))
     text = (
-        f"detections contradict the odometry: they would have its scales {ratio:.3g} (translation) and {turned:.3g} (rotation) "
-        "times as large, but the map as a whole is more probable with the odometry kept. Are the detections poor (very small "
-        "objects, the wrong camera)?"
+        f"detections contradict the odometry: they would have its translations err {ratio:.3g} times as much, but the map as a "
+        "whole is more probable with the odometry kept. Are ranges poor (very small objects, sizes misjudged, the wrong camera)?"
     )
     return replace(state, noise=replace(state.noise, warnings=(*state.noise.warnings, text)))
 
