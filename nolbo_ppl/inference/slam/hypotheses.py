@@ -48,6 +48,9 @@ RAISED = 3.0
 """Stated scales of the odometry raised by more than this at the end of a run: it is repeated from its start."""
 LEFT_BEHIND = 2.0
 """A scale of translations so many times the stated or the default one at the end of a run has a rival that keeps that."""
+PREFERENCE = 0.02
+"""Nats a detection by which a run that leaves the odometry far behind must be more probable than one that keeps it: evidence of
+large graphs is no truer than that (scales a few percent apart move it by a hundred nats)."""
 MIN_WEIGHT = 1e-4
 """Hypotheses of less weight are not kept."""
 
@@ -237,7 +240,7 @@ def explore(
         runs[0] = run_to_end(state, iterate, on_step)
     if (rival := with_odometry_kept(given, runs[0].state)) is not None:
         kept_run = run_to_end(rival, iterate, on_step)
-        if kept_run.log_evidence > runs[0].log_evidence:
+        if kept_run.log_evidence > runs[0].log_evidence - PREFERENCE * len(state.problem.observations):
             state, runs[0] = rival, replace(kept_run, state=told_of_kept(kept_run.state, runs[0]))
     if limit > 1 and len(state.static) > 1:
         associations = best_associations(state, count=limit)
