@@ -68,7 +68,7 @@ def training_of(config: ReproduceConfig, name: str, seed: int) -> TrainConfig:
         single_steps=0,
         scene_steps=sizes.scene_steps,
         batch=sizes.batch,
-        shape_batch=32 if sizes.batch > 4 else sizes.batch,
+        shape_batch=min(32, 2 * sizes.batch),
         shape_decode=8,
         evaluate_every=10**6,
         evaluate_scenes=64,

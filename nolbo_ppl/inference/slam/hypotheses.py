@@ -96,15 +96,15 @@ class Run:
 
 
 def start_of_run(state: SlamState, k: int) -> SlamState:
-    """The state run k begins with: other samples, another drift where nobody stated it."""
+    """The state run k begins with: other samples, another drift where nobody stated it and none is kept."""
     if k == 0:
         return state
     factor = DRIFT_FACTORS[k % len(DRIFT_FACTORS)]
     rotation, translation = stated_sigmas(state.problem, state.config)
     noise = replace(
         state.noise,
-        rotation_step=state.noise.rotation_step * (1.0 if rotation else factor),
-        translation_step=state.noise.translation_step * (1.0 if translation else factor),
+        rotation_step=state.noise.rotation_step * (1.0 if rotation or state.odometry_kept else factor),
+        translation_step=state.noise.translation_step * (1.0 if translation or state.odometry_kept else factor),
     )
     annealing = state.config.annealing
     if k % 2:  # a slower start, and more samples

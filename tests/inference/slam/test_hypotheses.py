@@ -9,7 +9,7 @@ import pytest
 
 import nolbo_ppl
 from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
-from nolbo_ppl.inference.slam.hypotheses import LEFT_BEHIND, with_odometry_kept
+from nolbo_ppl.inference.slam.hypotheses import LEFT_BEHIND, start_of_run, with_odometry_kept
 from nolbo_ppl.inference.slam.initialise import SlamState, init
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 
@@ -44,4 +44,7 @@ def test_a_rival_keeps_what_was_said() -> None:
     assert rival is not None and rival.odometry_kept
     np.testing.assert_allclose(rival.noise.translation_step, 0.05)
     np.testing.assert_allclose(rival.noise.rotation_step, 0.01)
+    unknown = replace(rival, config=nolbo_ppl.SlamConfig())  # further runs keep it too, where nobody stated the scales
+    np.testing.assert_allclose(start_of_run(unknown, 1).noise.translation_step, 0.05)
+    assert (start_of_run(replace(unknown, odometry_kept=False), 1).noise.translation_step > 0.1).all()
     assert rival.noise.report["odometry_translation_scale"] == pytest.approx(0.05)
