@@ -13,19 +13,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from nolbo_ppl.inference.slam.latent_mixture import LARGE_VARIANCE as LARGE_VARIANCE
-from nolbo_ppl.inference.slam.latent_mixture import LatentMixture, pair_log_density
+from nolbo_ppl.inference.slam.latent_mixture import LatentMixture
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation, fit_population
 from nolbo_ppl.inference.slam.slam_problem import NoiseModel, SlamConfig
 from nolbo_ppl.io.observations import Detections
 
 
 @dataclass(frozen=True)
 class FeaturePrior:
-    """Population of latents and categories, in its simplest form (one Gaussian, one histogram)."""
+    """Population of latents and categories."""
 
     mean: Float[np.ndarray, " d"]
-    """Mean latent."""
-    variance: Float[np.ndarray, " d"]
-    """Its variance over objects: that of the detections' latents less their errors."""
+    """Mean latent of all."""
+    population: LatentPopulation
+    """Where the latents of objects lie."""
     categories: tuple[str, ...]
     """Category names in use."""
     log_frequency: Float[np.ndarray, " c"]
@@ -67,12 +68,9 @@ class FeaturePrior:
         if modes_a is not None or modes_b is not None:
             a, b = modes_a or LatentMixture.of_one(latent_a), modes_b or LatentMixture.of_one(latent_b)
             category = np.where(known & (a.several | b.several), 0.0, category)
-            population = LatentMixture.of_one(np.broadcast_to(self.mean, latent_a.shape))
-            latent = pair_log_density(a, b, variance_a + variance_b) - pair_log_density(a, population, variance_a + self.variance)
+            latent = self.population.log_ratio_of_modes(a, variance_a, b, variance_b)
             return np.where(known, latent + np.minimum(category, 0.0), category)
-        latent = latent_log_density(latent_a, latent_b, variance_a + variance_b) - latent_log_density(
-            latent_a, self.mean, variance_a + self.variance
-        )
+        latent = self.population.log_ratio(latent_a, variance_a, latent_b, variance_b)
         return np.where(known, latent + np.minimum(category, 0.0), category)
 
 
@@ -82,11 +80,11 @@ def latent_log_density(x: np.ndarray, mean: np.ndarray, variance: np.ndarray) ->
 
 
 def fit_prior(table: Detections, config: SlamConfig, noise: NoiseModel | None = None) -> FeaturePrior:
-    """Moments of all latents, shares of all categories, and the share of true detections that objectness refers to.
+    """The population of latents, shares of all categories, and the share of true detections that objectness refers to.
 
     Args:
         table: the detections.
-        config: `objectness_prior` and `category_error`.
+        config: `objectness_prior`, `category_error` and `latent_correlation`.
         noise: scales of these rows; None: those the table states. Their variance is no part of the population's: counted
             twice, identical objects would give evidence (0.77 nats a match in 8 dimensions, 12 in 128).
     """
@@ -94,15 +92,19 @@ def fit_prior(table: Detections, config: SlamConfig, noise: NoiseModel | None = 
     d = table.latent_dim
     mean = table.latent[known].mean(axis=0) if known.any() else np.zeros(d)
     scale = np.nan_to_num((table.latent_scale if noise is None else noise.latent_scale)[known])
-    spread = np.mean((table.latent[known] - mean) ** 2 - scale**2, axis=0) if known.any() else np.ones(d)
-    variance = np.maximum(spread, 1e-12)
     named = [c for c in table.category if c is not None]
     categories, counts = np.unique(named, return_counts=True) if named else (np.zeros(0, str), np.zeros(0))
     shares = (counts + 1.0) / (counts.sum() + len(counts)) if len(counts) else counts
     share = config.objectness_prior
     if share is None:  # a calibrated objectness is right on average
         share = float(np.mean(np.clip(table.objectness, *config.objectness_limits))) if len(table) else 0.5
-    return FeaturePrior(mean, variance, tuple(str(c) for c in categories), np.log(shares), config.category_error, share)
+    population = LatentPopulation.of_one(mean, np.ones(d))
+    if known.any():
+        lookup = {str(name): k for k, name in enumerate(categories)}
+        label = np.array([-1 if name is None else lookup[str(name)] for name in table.category])[known]
+        between_views = (1.0 - (config.latent_correlation or 0.0)) * scale**2
+        population = fit_population(table.latent[known], between_views, label)
+    return FeaturePrior(mean, population, tuple(str(c) for c in categories), np.log(shares), config.category_error, share)
 
 
 def category_index(table: Detections, prior: FeaturePrior) -> Int[np.ndarray, " n"]:
@@ -112,12 +114,16 @@ def category_index(table: Detections, prior: FeaturePrior) -> Int[np.ndarray, " 
 
 
 def detection_features(
-    table: Detections, noise: NoiseModel, prior: FeaturePrior
+    table: Detections, noise: NoiseModel, prior: FeaturePrior, correlation: float = 0.0
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
-    """Latent, its variance (very large where missing) and category index of every detection."""
+    """Latent, its variance between views (very large where missing) and category index of every detection.
+
+    Of a latent's error the share `correlation` of the variance is one error for all views of an object. Two views of it do not
+    differ by that, and two objects differ by it as by their shapes: an association has `(1 - r) s^2` to go by.
+    """
     known = table.has_latent[:, None]
     latent = np.where(known, np.nan_to_num(table.latent), prior.mean)
-    variance = np.where(known, np.nan_to_num(noise.latent_scale) ** 2, LARGE_VARIANCE)
+    variance = np.where(known, (1.0 - correlation) * np.nan_to_num(noise.latent_scale) ** 2, LARGE_VARIANCE)
     return latent, variance, category_index(table, prior)
 
 
@@ -136,6 +142,17 @@ def correlated_variance(
     latent update); missing ones stay."""
     factor = 1.0 + correlation * np.maximum(count - 1.0, 0.0)
     return np.where(variance < LARGE_VARIANCE, variance * factor[:, None], variance)
+
+
+def variance_of_shape(between_views: Float[np.ndarray, "m d"], correlation: float) -> Float[np.ndarray, "m d"]:
+    """Variance of an object's latent about the truth, from that about what its views have in common; missing ones stay.
+
+    Args:
+        between_views: as landmarks hold it for associations: `1 - r` of the whole, whatever the number of views (views of one
+            track see one side, so that as much of what is left is taken to be alike in them as of the whole).
+        correlation: r.
+    """
+    return np.where(between_views < LARGE_VARIANCE, between_views / (1.0 - correlation), between_views)
 
 
 def weighted_latents(

@@ -83,17 +83,6 @@ def observed_latent_modes(table: Detections, latent: Float[np.ndarray, "n d"]) -
     return modes
 
 
-def pair_log_density(a: LatentMixture, b: LatentMixture, variance: Float[np.ndarray, "p d"]) -> Float[np.ndarray, " p"]:
-    """`log sum_kl w_k v_l N(a_k; b_l, variance)` of rows of two mixtures, nats."""
-    value = np.full(len(a), -np.inf)
-    constant = -0.5 * np.sum(np.log(2 * np.pi * variance), axis=-1)
-    for k in range(a.mean.shape[1]):
-        for m in range(b.mean.shape[1]):
-            square = np.sum((a.mean[:, k] - b.mean[:, m]) ** 2 / variance, axis=-1)
-            value = np.logaddexp(value, a.log_weight[:, k] + b.log_weight[:, m] - 0.5 * square)
-    return value + constant
-
-
 def chosen_modes(
     modes: LatentMixture,
     variance: Float[np.ndarray, "n d"],

@@ -35,7 +35,7 @@ class TrackletFeatures:
     latent: Float[np.ndarray, "m d"]
     """Posterior mean of the latent."""
     latent_variance: Float[np.ndarray, "m d"]
-    """Its variance; LARGE_VARIANCE where none was observed."""
+    """Its variance between views (`variance_of_shape` gives the whole); LARGE_VARIANCE where none was observed."""
     log_population: Float[np.ndarray, " m"]
     """Log density of its latent in the population of the others."""
     category: Int[np.ndarray, " m"]

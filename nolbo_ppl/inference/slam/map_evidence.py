@@ -13,7 +13,7 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float, Int
 
 from nolbo_ppl.geometry.pose import inverse, relative, transform
-from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_latent, latent_log_density
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, fuse_latent
 from nolbo_ppl.inference.slam.gaussian import position_log_density, squared_distance
 from nolbo_ppl.inference.slam.graph import odometry_rows
 from nolbo_ppl.inference.slam.initialise import base_graph
@@ -117,8 +117,7 @@ def feature_log_evidence(state: SlamState) -> float:
             if mean is None or spread is None:
                 mean, spread = z, own
                 continue
-            population = float(latent_log_density(z, prior.mean, prior.variance + own))
-            value += float(latent_log_density(z, mean, spread + own)) - population + min(ratio, 0.0)
+            value += float(prior.population.log_ratio(z[None], own[None], mean[None], spread[None])[0]) + min(ratio, 0.0)
             mean, spread = fuse_latent(mean, spread, z, own)
     return value
 

@@ -43,7 +43,7 @@ class Measurements:
     latent: Float[np.ndarray, "n d"]
     """Shape latent; the population's mean where missing."""
     latent_variance: Float[np.ndarray, "n d"]
-    """Its variance; LARGE_VARIANCE where missing."""
+    """Its variance between views of one object (`detection_features`); LARGE_VARIANCE where missing."""
     category: Int[np.ndarray, " n"]
     """Index of the category, -1 for none."""
     log_object: Float[np.ndarray, " n"]
@@ -81,10 +81,10 @@ def resolve(table: Detections, noise: NoiseModel, config: SlamConfig, prior: Fea
     Args:
         table: detections in camera frames.
         noise: scales of these rows.
-        config: symmetry by category and the limits of objectness.
+        config: symmetry by category, the limits of objectness, and how far views of an object err alike in their latents.
         prior: population of features, with the share of true detections that objectness refers to.
     """
-    latent, variance, category = detection_features(table, noise, prior)
+    latent, variance, category = detection_features(table, noise, prior, config.latent_correlation or 0.0)
     objectness = np.clip(table.objectness, *config.objectness_limits)
     share = prior.objectness_prior
     return Measurements(

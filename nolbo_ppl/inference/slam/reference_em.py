@@ -220,7 +220,7 @@ def e_step(state: ReferenceEmState) -> tuple[Float[np.ndarray, "g m"], Float[np.
     if seen.latent.shape[1]:
         known = seen.latent_variance[:, 0] < LARGE_VARIANCE
         latent, variance = seen.latent[known], seen.latent_variance[known]
-        population = latent_log_density(latent, state.prior.mean, variance + state.prior.variance)
+        population = state.prior.population.log_density(latent, variance)
         if seen.latent_modes is None:
             density = latent_log_density(latent[:, None], state.latent[None], variance[:, None])
         else:
@@ -239,8 +239,7 @@ def _latents_by_mode(state: ReferenceEmState, modes: LatentMixture) -> tuple[Flo
     """Log density of every mode of every latent given every landmark's, weight included, and of all in the population."""
     variance = state.measurements.latent_variance[:, None]
     by_mode = [latent_log_density(modes.mean, landmark, variance) for landmark in state.latent]
-    of_any = latent_log_density(modes.mean, state.prior.mean, variance + state.prior.variance)
-    population = np.logaddexp.reduce(modes.log_weight + of_any, axis=1)
+    population = state.prior.population.log_density_of_modes(modes, variance[:, 0])
     return modes.log_weight[..., None] + np.stack(by_mode, axis=-1), population
 
 

@@ -13,7 +13,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.pose import inverse, is_rotation, se3_exp, transform
 from nolbo_ppl.inference.slam.class_posterior import ConfusionModel, class_posterior, count_votes, fit_confusion
 from nolbo_ppl.inference.slam.data_association import Associations
-from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, variance_of_shape
 from nolbo_ppl.inference.slam.em import EmStepInfo
 from nolbo_ppl.inference.slam.graph import SlamEstimate, to_values
 from nolbo_ppl.inference.slam.hypotheses import MapHypothesis, mixture_covariances
@@ -195,6 +195,7 @@ class SlamResult:
         classes = self.class_posterior()
         total = np.bincount(self.associations.landmark, weights=self.associations.weight, minlength=len(poses))
         sizes = self._sizes()
+        variance = variance_of_shape(state.features.latent_variance, state.config.latent_correlation or 0.0)
         out = []
         for j, T in enumerate(poses):
             R = T[:3, :3]
@@ -210,7 +211,7 @@ class SlamResult:
                     existence=float(existence[j]),
                     class_posterior={c: float(p) for c, p in zip(state.prior.categories, classes[j])} if len(classes[j]) else {},
                     latent=state.features.latent[j] if known else None,
-                    latent_variance=state.features.latent_variance[j] if known else None,
+                    latent_variance=variance[j] if known else None,
                     size=sizes[j],
                     detections=float(total[j]),
                     first_frame=int(state.features.first[j]),

@@ -13,7 +13,8 @@ from nolbo_ppl.inference.slam.detection_features import (
     correlated_variance,
     weighted_latents,
 )
-from nolbo_ppl.inference.slam.incremental.running_map import new_landmark, stated_variance
+from nolbo_ppl.inference.slam.incremental.running_map import new_landmark, variance_between_views
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
 from nolbo_ppl.structures.detections import Detections
@@ -39,7 +40,7 @@ def test_variance_of_correlated_views_is_that_of_their_mean(correlation: float) 
 def test_the_online_system_widens_latents_of_views_that_are_alike() -> None:
     """A landmark's latent has the variance that the batch computes from the same views, over two passes together."""
     latent, scale, views, correlation = np.array([[0.2, -1.0]]), np.array([[0.3, 0.5]]), 4, 0.6
-    prior = FeaturePrior(np.zeros(2), np.ones(2), (), np.zeros(0), 0.9)
+    prior = FeaturePrior(np.zeros(2), LatentPopulation.of_one(np.zeros(2), np.ones(2)), (), np.zeros(0), 0.9)
     table = Detections.from_arrays(np.zeros(1, int), np.ones((1, 3)), latent=latent, latent_scale=scale)
     problem = SlamProblem(np.eye(4)[None], table)
     config = SlamConfig()
@@ -52,7 +53,7 @@ def test_the_online_system_widens_latents_of_views_that_are_alike() -> None:
     rows = np.zeros(views, int)
     batch_mean, batch = weighted_latents(np.repeat(latent, views, 0), np.repeat(scale**2, views, 0), rows, np.ones(views), 1)
     expected = correlated_variance(batch, np.array([float(views)]), correlation)[0]
-    np.testing.assert_allclose(stated_variance([first, single], correlation), [expected, scale[0] ** 2], rtol=1e-9)
+    np.testing.assert_allclose(variance_between_views([first, single], correlation), [expected, scale[0] ** 2], rtol=1e-9)
     np.testing.assert_allclose(first.latent, batch_mean[0], rtol=1e-9)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from nolbo_ppl.geometry.pose import make_pose
 from nolbo_ppl.inference.slam import IncrementalSlam
@@ -18,7 +17,6 @@ from nolbo_ppl.inference.slam.latent_mixture import (
     LatentMixture,
     chosen_modes,
     nearest_difference,
-    pair_log_density,
 )
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.absurd_values import without_absurd_values
@@ -32,28 +30,6 @@ CATEGORIES = ("car", "bus")
 MEANS = np.array([[2.0, 0.0, 0.0, 1.0], [-2.0, 1.0, 0.0, -1.0]])
 SCALE = 0.2
 FRAMES = 24
-
-
-def random_mixture(rng: np.random.Generator, n: int, modes: int, d: int) -> LatentMixture:
-    return LatentMixture(np.log(rng.dirichlet(np.ones(modes), n)), rng.standard_normal((n, modes, d)))
-
-
-def test_density_of_pairs_is_the_sum_over_modes() -> None:
-    rng = np.random.default_rng(0)
-    a, b, variance = random_mixture(rng, 5, 3, 2), random_mixture(rng, 5, 2, 2), rng.random((5, 2)) + 0.2
-    a.log_weight[4] = [0.0, -np.inf, -np.inf]
-    expected = np.zeros(5)
-    for k in range(3):
-        for m in range(2):
-            density = norm.pdf(a.mean[:, k], b.mean[:, m], np.sqrt(variance)).prod(axis=1)
-            expected += np.exp(a.log_weight[:, k] + b.log_weight[:, m]) * density
-    np.testing.assert_allclose(pair_log_density(a, b, variance), np.log(expected), rtol=1e-12)
-    one = LatentMixture.of_one(a.mean[:, 0])  # and it is a density: an integral over one side, by Monte Carlo
-    drawn = rng.uniform(-8, 8, (200_000, 2))
-    many = LatentMixture(np.tile(a.log_weight[:1], (len(drawn), 1)), np.tile(a.mean[:1], (len(drawn), 1, 1)))
-    value = np.exp(pair_log_density(many, LatentMixture.of_one(drawn), np.tile(variance[:1], (len(drawn), 1)))) * 16**2
-    assert abs(value.mean() - 1) < 5 * value.std() / np.sqrt(len(drawn))
-    assert len(one) == 5 and not one.several.any() and a.several.tolist() == [True] * 4 + [False]
 
 
 def flips(seed: int = 0, wrong: float = 0.4, objects: int = 6) -> tuple[SlamProblem, np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from nolbo_ppl.inference.slam.clusters import join
 from nolbo_ppl.inference.slam.consistent_cliques import close_constellations, find_loop_closure, joint_log_density, windows
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
 from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation
 from nolbo_ppl.inference.slam.loop_candidates import (
     POSITION_GATE,
     PosteriorSamples,
@@ -22,7 +23,7 @@ from nolbo_ppl.inference.slam.loop_candidates import (
     log_population,
 )
 
-PRIOR = FeaturePrior(np.zeros(2), np.ones(2), (), np.zeros(0), 0.05)
+PRIOR = FeaturePrior(np.zeros(2), LatentPopulation.of_one(np.zeros(2), np.ones(2)), (), np.zeros(0), 0.05)
 
 
 def features(

@@ -17,6 +17,7 @@ from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_marginals import frame_marginals
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
 from nolbo_ppl.inference.slam.graph import SlamEstimate
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation
 from nolbo_ppl.inference.slam.loop_candidates import PosteriorSamples, TrackletFeatures, candidate_pairs
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
@@ -94,7 +95,7 @@ def tracklets(rng: np.random.Generator, m: int) -> tuple[SlamEstimate, Posterior
 def test_candidates_in_runs_are_all_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(2)
     estimate, samples, features = tracklets(rng, 40)
-    prior = FeaturePrior(np.zeros(2), np.ones(2), (), np.zeros(0), 0.05)
+    prior = FeaturePrior(np.zeros(2), LatentPopulation.of_one(np.zeros(2), np.ones(2)), (), np.zeros(0), 0.05)
 
     def found() -> loop_candidates.Pairs:
         return candidate_pairs(estimate, samples, features, prior, SlamConfig(), inflation=1.0, floor=0.2)

@@ -10,10 +10,11 @@ from scipy.stats import multivariate_normal
 
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation
 from nolbo_ppl.inference.slam.tracking import Tracker
 from tests.position_measurements import position_measurements
 
-PRIOR = FeaturePrior(np.zeros(0), np.zeros(0), (), np.zeros(0), 0.05)
+PRIOR = FeaturePrior(np.zeros(0), LatentPopulation.of_one(np.zeros(0), np.zeros(0)), (), np.zeros(0), 0.05)
 
 
 def covariances(rng: np.random.Generator, n: int) -> np.ndarray:

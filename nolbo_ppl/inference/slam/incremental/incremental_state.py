@@ -29,6 +29,7 @@ from nolbo_ppl.inference.slam.incremental.live_tracks import LiveTrack
 from nolbo_ppl.inference.slam.incremental.running_map import MAX_FRAMES, RunningLandmark, RunningMap
 from nolbo_ppl.inference.slam.incremental.state_checks import check_links, typed_columns
 from nolbo_ppl.inference.slam.latent_mixture import LatentMixture
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
@@ -38,6 +39,7 @@ from nolbo_ppl.structures.detections import ARRAYS, OPTIONAL, TEXTS, Detections
 
 VERSION = 2
 """Version of the file."""
+POPULATION_ARRAYS = ("log_weight", "mean", "variance")
 LANDMARK_ARRAYS = ("latent", "latent_variance", "votes", "size", "information", "shared", "own")
 LANDMARK_NUMBERS = (
     "number",
@@ -78,8 +80,10 @@ def save_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
         "category_error": slam.prior.category_error,
         "objectness_prior": slam.prior.objectness_prior,
     }
-    for name in ("mean", "variance", "log_frequency"):
+    for name in ("mean", "log_frequency"):
         arrays[f"prior/{name}"] = getattr(slam.prior, name)
+    for name in POPULATION_ARRAYS:
+        arrays[f"prior/population/{name}"] = getattr(slam.prior.population, name)
     arrays["T_world_camera"], arrays["last_odometry"] = slam.T_world_camera, slam.last_odometry
     _put_graph(slam.graph, arrays, meta)
     _put_loops(slam.loops, arrays, meta)
@@ -117,7 +121,7 @@ def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
             slam.last_oriented = meta.get("last_oriented", slam.frames - 1)  # files of 0.1.0: landmarks free to turn, as there
             slam.prior = FeaturePrior(
                 archive.array("prior/mean", (None,)),
-                archive.array("prior/variance", (None,)),
+                _get_population(archive),
                 tuple(meta["categories"]),
                 archive.array("prior/log_frequency", (len(meta["categories"]),)),
                 float(meta["category_error"]),
@@ -138,6 +142,18 @@ def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
             raise error if str(path) in str(error) else located(error, path) from None
         except (GraphError, KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, RecursionError) as error:
             raise input_error("not a saved online system", got=f"{type(error).__name__}: {error}", file=path) from None
+
+
+def _get_population(archive: Npz) -> LatentPopulation:
+    """The population of latents; files of before 0.3 hold one Gaussian."""
+    if "prior/population/mean" not in archive.names:
+        return LatentPopulation.of_one(archive.array("prior/mean", (None,)), archive.array("prior/variance", (None,)))
+    shapes = ((None,), (None, None), (None,))
+    log_weight, mean, variance = (archive.array(f"prior/population/{n}", s) for n, s in zip(POPULATION_ARRAYS, shapes))
+    d = len(archive.array("prior/mean", (None,)))
+    if mean.shape != (len(log_weight), d) or len(variance) != d or not len(log_weight) or (variance <= 0).any():
+        raise ValueError(f"a population of shapes {log_weight.shape}, {mean.shape}, {variance.shape}")
+    return LatentPopulation(log_weight, mean, variance)
 
 
 # -- graph --------------------------------------------------------------------------------------------------------------

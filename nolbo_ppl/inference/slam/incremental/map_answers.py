@@ -9,12 +9,11 @@ densities is the marginal likelihood (chain rule). Categories: as the batch does
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
 from nolbo_ppl.inference.slam.class_posterior import class_posterior, fit_confusion
-from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior
+from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, variance_of_shape
 from nolbo_ppl.inference.slam.incremental.incremental_graph import IncrementalGraph
-from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, stated_variance
+from nolbo_ppl.inference.slam.incremental.running_map import RunningLandmark, RunningMap, variance_between_views
 from nolbo_ppl.inference.slam.slam_problem import SlamConfig
 from nolbo_ppl.structures.landmark import Landmark
 
@@ -34,7 +33,8 @@ def map_landmarks(running: RunningMap, graph: IncrementalGraph, config: SlamConf
     landmarks = [running.landmarks[j] for j in running.numbers.tolist()]
     if not landmarks:
         return ()
-    variance: Float[np.ndarray, "m d"] = stated_variance(landmarks, config.latent_correlation or 0.0)
+    correlation = config.latent_correlation or 0.0
+    variance = variance_of_shape(variance_between_views(landmarks, correlation), correlation)
     classes = class_posteriors(landmarks, running.prior)
     out = []
     for row, landmark in enumerate(landmarks):

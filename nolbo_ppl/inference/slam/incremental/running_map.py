@@ -180,8 +180,8 @@ def count_detections(
         landmark.shared, landmark.own = landmark.shared + alike[k], landmark.own + alike[k] @ alike[k].T
 
 
-def stated_variance(landmarks: list[RunningLandmark], correlation: float) -> Float[np.ndarray, "m d"]:
-    """Variances of their latents with the correlation of views; LARGE_VARIANCE where none was observed."""
+def variance_between_views(landmarks: list[RunningLandmark], correlation: float) -> Float[np.ndarray, "m d"]:
+    """Variances of their latents between views, views of one track alike; LARGE_VARIANCE where none was observed."""
     variance = np.array([j.latent_variance for j in landmarks])
     variance = np.where(variance < 0.5 * LARGE_VARIANCE, variance, LARGE_VARIANCE)
     return correlated_variance(variance, np.array([float(j.latent_views) for j in landmarks]), correlation)
@@ -200,7 +200,7 @@ def landmark_features(
     """
     numbers = {j.number for j in landmarks}
     everyone = landmarks + [j for j in others if j.number not in numbers]
-    variance = stated_variance(everyone, correlation)
+    variance = variance_between_views(everyone, correlation)
     rarity = log_population(np.array([j.latent for j in everyone]), variance, fresh)
     count = len(landmarks)
     return TrackletFeatures(

@@ -237,18 +237,19 @@ def _latent_scale(
     if not table.latent_dim:
         return scale
     default = config.latent_scale
+    own = 1.0 - (config.latent_correlation or 0.0)  # share of the variance in which two views of an object differ
     both = table.has_latent[pairs.first] & table.has_latent[pairs.second] if len(pairs.first) else np.zeros(0, bool)
     if both.sum() >= 5:
         i, j = pairs.first[both], pairs.second[both]
         difference = nearest_difference(table, i, j)
         weight = np.repeat(pairs.weight[both], difference.shape[1])
-        measured = robust_scale(difference.ravel(), weight) / np.sqrt(2)
+        measured = robust_scale(difference.ravel(), weight) / np.sqrt(2 * own)
         report["latent_scale"] = measured
         if default is None:
             default = max(measured, 1e-6)
         stated = np.isfinite(scale[i]).all(axis=1) & np.isfinite(scale[j]).all(axis=1)
         if stated.sum() >= 30:
-            normalised = (difference / np.sqrt(scale[i] ** 2 + scale[j] ** 2))[stated].ravel()
+            normalised = (difference / np.sqrt(own * (scale[i] ** 2 + scale[j] ** 2)))[stated].ravel()
             ratio = robust_scale(normalised, np.repeat(pairs.weight[both][stated], difference.shape[1]))
             report["latent_ratio_to_stated"] = ratio
             if ratio > TOO_SMALL:

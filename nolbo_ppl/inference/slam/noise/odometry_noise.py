@@ -273,7 +273,7 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
     Scales nobody stated go up and down where `MIN_STATED` steps tell them. Stated ones stay unless they are too small by more
     than a third (reported, and raised with `correct_scales`).
     """
-    if len(state.problem) < 3 or not len(state.rows) or state.odometry_kept:
+    if len(state.problem) < 3 or not len(state.rows):
         return state
     report, warnings = dict(state.noise.report), list(state.noise.warnings)
     factors = np.ones(2)
@@ -284,6 +284,9 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
         if told < MIN_STATED:
             continue
         ratio = float(np.clip(np.sqrt(squared), 1 / LARGEST_CHANGE, LARGEST_CHANGE))
+        if state.odometry_kept and name == "translation":  # no looser than was said
+            said = step_sigmas(state.problem, state.config)[1]
+            ratio = min(ratio, float(np.median(said / state.noise.translation_step)))
         if not stated_sigmas(state.problem, state.config)[axis]:
             factors[axis] = ratio
         elif ratio > TOO_SMALL:

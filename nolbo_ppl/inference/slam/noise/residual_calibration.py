@@ -170,7 +170,7 @@ def calibrate(state: SlamState) -> SlamState:
 
 
 def latent_width(state: SlamState) -> float:
-    """Scale of latents about their tracks' means, in units of their scales; NaN without enough of them."""
+    """Scale of latents about their tracks' means, in units of their scales between views; NaN without enough of them."""
     rows = state.rows[(state.weight > 0.5) & state.problem.observations.has_latent[state.rows]]
     track = state.tracklets.of_observation[rows]
     count = np.bincount(track[track >= 0], minlength=len(state.tracklets)) if len(rows) else np.zeros(0, int)
@@ -183,7 +183,7 @@ def latent_width(state: SlamState) -> float:
     precision, total = (np.zeros((track.max() + 1, latent.shape[1])) for _ in range(2))
     np.add.at(precision, track, scale**-2.0)
     np.add.at(total, track, latent / scale**2)
-    left = 1 - scale**-2.0 / precision[track]
+    left = (1 - scale**-2.0 / precision[track]) * (1.0 - (state.config.latent_correlation or 0.0))
     return robust_scale(((latent - (total / precision)[track]) / scale / np.sqrt(np.maximum(left, 1e-9))).ravel())
 
 

@@ -15,13 +15,14 @@ from nolbo_ppl.inference.slam.incremental.running_map import (
     RunningMap,
     count_detections,
     new_landmark,
-    stated_variance,
+    variance_between_views,
 )
+from nolbo_ppl.inference.slam.latent_population import LatentPopulation
 from nolbo_ppl.inference.slam.measurements import Measurements
 from nolbo_ppl.inference.slam.orientation import OrientationModes
 from nolbo_ppl.structures.noise_model import NoiseModel
 
-PRIOR = FeaturePrior(np.zeros(3), np.ones(3), ("car", "chair"), np.log([0.5, 0.5]), 0.05)
+PRIOR = FeaturePrior(np.zeros(3), LatentPopulation.of_one(np.zeros(3), np.ones(3)), ("car", "chair"), np.log([0.5, 0.5]), 0.05)
 NOISE = NoiseModel(
     rotation_step=np.zeros(0),
     translation_step=np.zeros(0),
@@ -121,7 +122,7 @@ def test_two_halves_are_the_whole() -> None:
     precision = 1.0 / measurements.latent_variance[seen]
     mean = (precision * measurements.latent[seen]).sum(axis=0) / precision.sum(axis=0)
     np.testing.assert_allclose(joined.latent, mean, rtol=1e-5)  # the prior's variance is wide, not infinite
-    correlated = stated_variance([joined], 0.2)[0]
+    correlated = variance_between_views([joined], 0.2)[0]
     np.testing.assert_allclose(correlated, (1 + 0.2 * (seen.sum() - 1)) / precision.sum(axis=0), rtol=1e-5)
 
 

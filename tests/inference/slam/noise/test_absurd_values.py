@@ -34,7 +34,7 @@ def test_one_absurd_latent_is_set_aside_by_name(value: float) -> None:
     assert not cleaned.observations.has_latent[7] and cleaned.observations.has_latent.sum() == 59
     assert len(warnings) == 1 and "car-7 " in warnings[0]
     state = init(detections(latent=latent, id=names), SlamConfig())
-    assert np.isfinite(state.prior.variance).all() and state.prior.variance.max() < 10
+    assert np.isfinite(state.prior.population.variance).all() and state.prior.population.variance.max() < 10
     assert any("car-7 " in w for w in state.noise.warnings)
 
 
