@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from nolbo_ppl.inference.slam.detection_features import LARGE_VARIANCE, FeaturePrior, latent_log_density
 from nolbo_ppl.inference.slam.gaussian import squared_distance
@@ -24,6 +25,8 @@ CHUNK_PAIRS = 1 << 21
 """Pairs of tracklets that are looked at together."""
 MAX_CANDIDATES = 256
 """Older tracklets that are candidates for one: on many laps the number of all pairs grows with their square."""
+POPULATION = 30
+"""Tracklets about a place, and of the whole map, whose orientations those of a pair are compared with."""
 POSITION_GATE = 25.0
 """Squared Mahalanobis distance beyond which two tracklets are no candidates."""
 
@@ -282,17 +285,28 @@ def _orientation_log_ratio(
         deviation = samples.rotation[a[part]] - samples.rotation[b[part]]
         scale[part] = np.sqrt(np.mean(deviation**2, axis=(1, 2)) + 0.02**2)
     log_density = orientation_log_density(R[b], R[a], scale, features.symmetry[a], config)
-    # The population of orientations: every k-th tracklet, seen with the same uncertainty as the pair's.
+    # The population of orientations: the tracklets about, for what stands beside a road stands along it, and as many of all,
+    # seen with the same uncertainty as the pair's.
     oriented = np.flatnonzero(features.oriented)
-    others = oriented[:: max(1, len(oriented) // 60)]
     rows, inverse = np.unique(a, return_inverse=True)
+    others = _neighbours_and_others(estimate.T_world_landmark[:, :3, 3], rows, oriented)
     typical = np.zeros(len(rows))
     np.maximum.at(typical, inverse, scale)
-    grid_a, grid_c = np.repeat(rows, len(others)), np.tile(others, len(rows))
+    count = others.shape[1]
+    grid_a = np.repeat(rows, count)
     population = orientation_log_density(
-        R[grid_c], R[grid_a], np.repeat(typical, len(others)), features.symmetry[grid_a], config
-    ).reshape(len(rows), len(others))
-    population = np.where(others[None] == rows[:, None], -np.inf, population)
-    log_population = np.logaddexp.reduce(population, axis=1) - np.log(max(len(others), 1))
+        R[others.ravel()], R[grid_a], np.repeat(typical, count), features.symmetry[grid_a], config
+    ).reshape(len(rows), count)
+    population = np.where(others == rows[:, None], -np.inf, population)
+    log_population = np.logaddexp.reduce(population, axis=1) - np.log(max(count, 1))
     from_uniform = orientation_log_density(R[a], R[a], np.full(len(a), 1e3), features.symmetry[a], config)
     return log_density - np.maximum(log_population[inverse], from_uniform)
+
+
+def _neighbours_and_others(
+    position: Float[np.ndarray, "m 3"], rows: Int[np.ndarray, " r"], among: Int[np.ndarray, " o"]
+) -> Int[np.ndarray, "r c"]:
+    """Some tracklets for each of some rows: the nearest ones, and as many evenly spread over all."""
+    spread = among[:: max(1, len(among) // POPULATION)]
+    _, nearest = KDTree(position[among]).query(position[rows], k=np.arange(1, min(POPULATION, len(among)) + 1))
+    return np.concatenate([among[nearest], np.tile(spread, (len(rows), 1))], axis=1)
