@@ -92,10 +92,12 @@ def associate_detections(state: SlamState, linearisation: Linearisation, rng: np
         background = np.maximum(found.null - new, 0.0)
         hits = np.bincount(pairs.landmark, weight, minlength=m).astype(np.float64)
         model = replace(model, score_correlation=score_correlation(seen, pairs, weight))
-        log_odds = existence_log_odds(state, pairs, weight, model, of_landmark, log_density)
+        # Rates first, by what existed so far: under those that the first round begins with, every object seen in few of the
+        # frames that have it somewhere in view would be none, and what is left would make the rates higher still.
         model = estimate_frame_model(
             model, seen, background, new, np.exp(log_once), of_landmark, places.middle, hit_cell, weight, expit(log_odds), hits
         )
+        log_odds = existence_log_odds(state, pairs, weight, model, of_landmark, log_density)
     listed = weight > LISTED
     return Associations(
         row=pairs.row[listed],

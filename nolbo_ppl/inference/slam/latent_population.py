@@ -7,10 +7,12 @@ tens of nats in sixteen dimensions, where the category is worth the log of its s
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.cluster.vq import kmeans2
 
 from nolbo_ppl.inference.slam.latent_mixture import LatentMixture
 
@@ -18,6 +20,10 @@ LEAST_VARIANCE = 1e-12
 """Of a coordinate over objects."""
 ROUNDS = 20
 """Rounds of expectation and maximisation: names that are wrong are outvoted by the latents."""
+CLUSTERS = (1, 2, 4, 8)
+"""Numbers of components that are tried where nobody names categories."""
+LEAST_OF_CLUSTER = 20
+"""Latents for each of them."""
 MOST_ROWS = 5000
 """Latents it is fitted to, spread evenly over all."""
 
@@ -98,7 +104,9 @@ class LatentPopulation:
 def fit_population(
     latent: Float[np.ndarray, "n d"], between_views: Float[np.ndarray, "n d"], name: Int[np.ndarray, " n"]
 ) -> LatentPopulation:
-    """Fit the mixture by expectation and maximisation, begun with what detections are named; one Gaussian where none is.
+    """Fit the mixture by expectation and maximisation, begun with what detections are named.
+
+    Where none is named, clusters take the place of categories, as many of `CLUSTERS` as Schwarz's criterion asks for.
 
     Args:
         latent: of detections, at least one.
@@ -107,17 +115,40 @@ def fit_population(
     """
     some = np.unique(np.linspace(0, len(latent) - 1, min(len(latent), MOST_ROWS)).astype(int))
     latent, between_views, name = latent[some], between_views[some], name[some]
-    own = between_views.mean(axis=0)
+    if (name >= 0).any():
+        found, _ = _fitted(latent, name)
+    else:
+        starts = [_clusters(latent, k) for k in CLUSTERS if k == 1 or k * LEAST_OF_CLUSTER <= len(latent)]
+        fits = [_fitted(latent, start) for start in starts]
+        found = max(fits, key=lambda fit: fit[1] - 0.5 * fit[0].mean.size * np.log(len(latent)))[0]
+    variance = np.maximum(found.variance - between_views.mean(axis=0), LEAST_VARIANCE)
+    return LatentPopulation(found.log_weight, found.mean, variance)
+
+
+def _clusters(latent: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, " n"]:
+    """Nearest of some means, chosen far apart: the same for the same latents."""
+    if count == 1 or len(np.unique(latent, axis=0)) <= count:
+        return np.zeros(len(latent), dtype=np.int64)
+    scale = np.maximum(latent.std(axis=0), np.sqrt(LEAST_VARIANCE))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a mean that nothing is nearest to: it is dropped
+        return np.asarray(kmeans2(latent / scale, count, minit="++", seed=0)[1], dtype=np.int64)
+
+
+def _fitted(latent: Float[np.ndarray, "n d"], name: Int[np.ndarray, " n"]) -> tuple[LatentPopulation, float]:
+    """The mixture with the whole variance of a component, and its log likelihood."""
     share = (np.unique(name)[None] == name[:, None]).astype(np.float64)
-    for rounds in range(ROUNDS if share.shape[1] > 1 else 1):
+    rounds = ROUNDS if share.shape[1] > 1 else 1
+    while True:
         count = share.sum(axis=0)
         mean = (share.T @ latent) / count[:, None]
         square = sum(share[:, k] @ (latent - mean[k]) ** 2 for k in range(len(count))) / len(latent)
-        total = np.maximum(square, LEAST_VARIANCE)
-        if rounds + 1 < ROUNDS:
-            joint = np.log(count) - 0.5 * np.stack([np.sum((latent - m) ** 2 / total, axis=1) for m in mean], axis=1)
-            share = np.exp(joint - np.logaddexp.reduce(joint, axis=1, keepdims=True))
-            share = share[:, share.sum(axis=0) > 0.5]
-            share /= share.sum(axis=1, keepdims=True)
-    variance = np.maximum(total - own, LEAST_VARIANCE)
-    return LatentPopulation(np.log(count / count.sum()), mean, variance)
+        found = LatentPopulation(np.log(count / count.sum()), mean, np.maximum(square, LEAST_VARIANCE))
+        joint = found.log_weight - 0.5 * np.stack([np.sum((latent - m) ** 2 / found.variance, axis=1) for m in mean], axis=1)
+        whole = np.logaddexp.reduce(joint, axis=1, keepdims=True)
+        rounds -= 1
+        if rounds <= 0:
+            return found, float(whole.sum() - 0.5 * len(latent) * np.sum(np.log(2 * np.pi * found.variance)))
+        share = np.exp(joint - whole)
+        share = share[:, share.sum(axis=0) > 0.5]
+        share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-300)

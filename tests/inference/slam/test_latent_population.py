@@ -65,9 +65,22 @@ def test_wrong_names_are_outvoted() -> None:
     np.testing.assert_allclose(np.exp(found.log_weight[order]), np.sort(share)[::-1], atol=0.02)
     np.testing.assert_allclose(found.mean[order], means[np.argsort(-share)], atol=5 * np.sqrt(1.3 / 500))
     np.testing.assert_allclose(found.variance, 1.0, atol=5 * 1.3 * np.sqrt(2 / n))
-    alone = fit_population(latent, np.full((n, 6), own), np.full(n, -1))
-    assert len(alone.mean) == 1
-    np.testing.assert_allclose(alone.variance, latent.var(axis=0) - own, rtol=1e-9)
+
+
+def test_clusters_stand_in_for_names() -> None:
+    rng = np.random.default_rng(5)
+    n, means, own = 2000, 5.0 * rng.standard_normal((4, 5)), 0.3
+    latent = means[rng.integers(4, size=n)] + np.sqrt(1 + own) * rng.standard_normal((n, 5))
+    found = fit_population(latent, np.full((n, 5), own), np.full(n, -1))
+    assert len(found.mean) == 4
+    np.testing.assert_allclose(found.variance, 1.0, atol=5 * 1.3 * np.sqrt(2 / n))
+    one = fit_population(latent - latent.mean(0), np.full((n, 5), own), np.zeros(n, int))
+    assert len(one.mean) == 1
+    np.testing.assert_allclose(one.variance, latent.var(axis=0) - own, rtol=1e-9)
+    alone = fit_population(rng.standard_normal((n, 5)), np.zeros((n, 5)), np.full(n, -1))
+    assert len(alone.mean) == 1  # one Gaussian is one cluster
+    same = fit_population(np.ones((100, 2)), np.zeros((100, 2)), np.full(100, -1))
+    assert np.isfinite(same.log_density(np.ones((1, 2)), np.ones((1, 2)))).all()
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
@@ -118,7 +131,7 @@ def test_a_shared_category_is_worth_its_share() -> None:
         variance = np.full((200, d), 0.25)
         ratio = np.concatenate([found.log_ratio(seen[rows], variance, seen[np.roll(rows, 1)], variance) for rows in kind])
         assert ratio.mean() < np.log(4) + 0.1  # one Gaussian of all categories: 7 and 98 nats
-        wide = fit_population(seen, np.full((2000, d), 0.25), np.full(2000, -1))
+        wide = fit_population(seen, np.full((2000, d), 0.25), np.zeros(2000, int))
         assert wide.log_ratio(seen[kind[0]], variance, seen[np.roll(kind[0], 1)], variance).mean() > d
 
 
