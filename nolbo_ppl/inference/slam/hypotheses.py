@@ -26,7 +26,7 @@ from nolbo_ppl.inference.slam.graph import SlamEstimate
 from nolbo_ppl.inference.slam.map_evidence import map_log_evidence, trajectory_distance
 from nolbo_ppl.inference.slam.map_refinement import finish
 from nolbo_ppl.inference.slam.noise.noise_estimation import step_sigmas
-from nolbo_ppl.inference.slam.noise.odometry_noise import stated_sigmas
+from nolbo_ppl.inference.slam.noise.odometry_noise import leaves_odometry, stated_sigmas
 from nolbo_ppl.inference.slam.shared_errors import linearise_answer
 from nolbo_ppl.inference.slam.slam_state import SlamState
 
@@ -46,8 +46,6 @@ AMBIGUOUS = 0.05
 """A rival with more weight than this makes the answer ambiguous."""
 RAISED = 3.0
 """Stated scales of the odometry raised by more than this at the end of a run: it is repeated from its start."""
-LEFT_BEHIND = 2.0
-"""A scale of translations so many times the stated or the default one at the end of a run has a rival that keeps that."""
 PREFERENCE = 0.02
 """Nats a detection by which a run that leaves the odometry far behind must be more probable than one that keeps it: evidence of
 large graphs is no truer than that (scales a few percent apart move it by a hundred nats)."""
@@ -146,7 +144,7 @@ def with_odometry_kept(start: SlamState, end: SlamState) -> SlamState | None:
     if not len(start.noise.rotation_step):
         return None
     rotation, translation, _ = step_sigmas(start.problem, start.config)
-    if float(np.median(end.noise.translation_step / translation)) < LEFT_BEHIND:
+    if not leaves_odometry(end):
         return None
     if not stated_sigmas(start.problem, start.config)[0]:
         rotation = start.noise.rotation_step

@@ -9,11 +9,13 @@ import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
+from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections, rates_report
 from nolbo_ppl.inference.slam.em import make_landmark_equalities
 from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
+from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import LandmarkEqualities, optimize
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
@@ -25,7 +27,7 @@ from nolbo_ppl.inference.slam.initialise import (
 )
 from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.loop_candidates import Pairs, candidate_pairs, posterior_samples
-from nolbo_ppl.inference.slam.noise.odometry_noise import refine_odometry, settle_odometry, warn_of_contradiction
+from nolbo_ppl.inference.slam.noise.odometry_noise import leaves_odometry, refine_odometry, settle_odometry, warn_of_contradiction
 from nolbo_ppl.inference.slam.noise.residual_calibration import calibrate
 from nolbo_ppl.inference.slam.slam_state import object_log_density
 
@@ -35,6 +37,10 @@ MERGE_LOG_ODDS = 3.0
 """Two landmarks are merged in the end when one explains them better by this many nats."""
 BROKEN_LINK = 6.0
 """A link stretched to this many of its scales by the others is cut."""
+BROKEN_FACTOR = 6.0
+"""Detections that are left so many of their scales from a landmark do not move it, whatever their marginals say."""
+CONSISTENT_ROUNDS = 3
+"""Solves in which such detections are sought, the last one included."""
 SMALLEST_MARGINAL = 0.01
 """Associations of lower probability are left out of the map's M-step."""
 
@@ -118,9 +124,7 @@ def merge_duplicates(state: SlamState, rng: np.random.Generator) -> SlamState:
 def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, Associations]:
     """E-step of every detection against the map: each enters the graph with its marginals, one factor a landmark.
 
-    Detections of moving tracks stay out, and so do those that contradict the landmark as it stands: a place known to metres may
-    well be that of a near detection six metres off, known to centimetres, but if it is not, no other factor holds the landmark,
-    and with it the trajectory, against it (2 m of error became 16 in one solve).
+    Detections of moving tracks stay out.
     """
     found = associate_detections(state, linearise(base_graph(state), state.estimate), rng)
     use = (found.weight > SMALLEST_MARGINAL) & ~moving_detections(state)[found.row]
@@ -129,7 +133,14 @@ def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, 
         state.measurements, state.config, state.prior, rows, landmark, weight, len(state.estimate.T_world_landmark)
     )
     state = replace(state, rows=rows, landmark=landmark, weight=weight, features=features, frame_model=found.model)
-    return replace(state, weight=weight * inlier_weights(state)), found
+    return state, found
+
+
+def _stretch(state: SlamState) -> Float[np.ndarray, " k"]:
+    """Distance of each detection in the graph from its landmark as it stands, in the sensor's scales."""
+    seen = state.measurements.select(state.rows)
+    local = transform(inverse(state.estimate.T_world_camera[seen.frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
+    return np.sqrt(squared_distance(local - seen.position, seen.covariance)[0])
 
 
 def solve_soft(state: SlamState, tolerance: float = 1e-8) -> SlamState:
@@ -156,6 +167,21 @@ def drop_empty(state: SlamState, minimum: float) -> SlamState:
     )
     features = tracklet_features(state.measurements, state.config, state.prior, state.rows, landmark, state.weight, count)
     return replace(state, features=features)
+
+
+def solve_consistent(state: SlamState, factors: tuple[float, float] = (1.0, 1.0)) -> SlamState:
+    """`solve_settled` without what stays far from its landmark, begun again: while the odometry is believed.
+
+    A place known to metres may well be that of a near detection six metres off, known to centimetres; but if it is not, no other
+    factor holds the landmark, and with it the trajectory, against it (2 m of error became 16 in one solve).
+    """
+    for _ in range(CONSISTENT_ROUNDS):
+        solved = solve_settled(state, factors)
+        far = (_stretch(solved) > BROKEN_FACTOR) & (state.weight > 0)
+        if leaves_odometry(state) or not far.any():
+            break
+        state = replace(state, weight=np.where(far, 0.0, state.weight))
+    return solved
 
 
 def solve_settled(state: SlamState, factors: tuple[float, float]) -> SlamState:
@@ -192,7 +218,7 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     # Again: passes that differed by more than the first scales allowed are joined only now.
     state = solve_clean(calibrate(solve_clean(state, repeats=1)))
     state, _ = reassociate(state, rng)
-    state = solve_soft(drop_empty(state, 0.5))
+    state = solve_consistent(drop_empty(state, 0.5))
     factors = (1.0, 1.0)
     if len(state.rows):
         state = fit_odometry(state)
@@ -202,7 +228,7 @@ def finish(state: SlamState) -> tuple[SlamState, Associations]:
     for _ in range(3):  # landmarks that lost what placed them are no part of the answer
         if not len(found.existence) or np.bincount(found.landmark, found.weight, minlength=len(found.existence)).min() >= 0.5:
             break
-        state = solve_settled(drop_empty(final, 0.5), factors)
+        state = solve_consistent(drop_empty(final, 0.5), factors)
         final, found = reassociate(state, rng)
     noise = replace(final.noise, report=final.noise.report | rates_report(found, len(state.problem)))
     final = replace(final, rows=state.rows, landmark=state.landmark, weight=state.weight, features=state.features, noise=noise)

@@ -9,8 +9,9 @@ import pytest
 
 import nolbo_ppl
 from nolbo_ppl.data.simulate import WorldConfig, simulate_circuit, simulate_sequence
-from nolbo_ppl.inference.slam.hypotheses import LEFT_BEHIND, start_of_run, with_odometry_kept
+from nolbo_ppl.inference.slam.hypotheses import start_of_run, with_odometry_kept
 from nolbo_ppl.inference.slam.initialise import SlamState, init
+from nolbo_ppl.inference.slam.noise.odometry_noise import LEFT_BEHIND
 from nolbo_ppl.metrics.trajectory import trajectory_errors
 
 

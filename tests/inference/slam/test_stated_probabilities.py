@@ -15,7 +15,7 @@ from nolbo_ppl.data.simulate import DetectorConfig, SimulatedSequence, WorldConf
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, SlamResult, solve, solve_with_associations
 from nolbo_ppl.inference.slam.class_posterior import class_posterior, fit_confusion, votes_log_likelihood
-from nolbo_ppl.inference.slam.detection_features import fit_prior, latent_log_density
+from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.detection_pairs import detection_pairs
 from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
@@ -188,8 +188,7 @@ def test_identical_objects_give_no_evidence() -> None:
         one = np.full((600, d), 0.7**2)
         none = np.full(600, -1)
         ratio = prior.log_likelihood_ratio(latent, one, none, landmark, one / 30, none)
-        exact = latent_log_density(latent, landmark, one + one / 30) - latent_log_density(latent, 0 * latent, one)
-        assert abs(ratio.mean() - exact.mean()) < 0.1 * np.sqrt(d)
+        assert abs(ratio.mean()) < 0.5
         assert ratio.mean() < 0.3
 
 

@@ -31,7 +31,10 @@ MIN_SUPPORT = 2.0
 """A correction of the odometry must gain as much log evidence over an odometry without noise, nats."""
 NO_NOISE = 1 / 64
 """Factor on the default scales that stands for an odometry without noise."""
-WORTHLESS = 0.45
+LEFT_BEHIND = 2.0
+"""A scale of translations so many times the stated or the default one leaves the odometry: a run that ends so has a rival that
+keeps it."""
+WORTHLESS = 0.4
 """Scale over the length of the steps from which on a warning says that the detections contradict the odometry."""
 WELL_STATED = 30.0
 """Steps' worth of information below which a scale nobody stated is called a guess."""
@@ -252,6 +255,12 @@ def _stiffest(choices: list[tuple[float, float]], log_evidence: Float[np.ndarray
         (k for k in range(len(choices)) if log_evidence[k] > log_evidence.max() - MIN_SUPPORT),
         key=lambda k: ((choices[k][0] < 1) + (choices[k][1] < 1), log_evidence[k]),
     )
+
+
+def leaves_odometry(state: SlamState) -> bool:
+    """Whether translations are taken to err far more than was stated, or than the default says."""
+    said = step_sigmas(state.problem, state.config)[1]
+    return bool(len(said)) and float(np.median(state.noise.translation_step / said)) >= LEFT_BEHIND
 
 
 def warn_of_contradiction(state: SlamState) -> SlamState:
