@@ -70,7 +70,7 @@ class SlamState:
     """Factors the steps of the given odometry were multiplied by in `problem`, where its scale drifts (`scale_drift`)."""
 
     odometry_kept: bool = False
-    """The odometry's scales are not fitted: a run that asks what the detections are worth if the odometry is as good as said."""
+    """The odometry's translations are no looser than was said: a run that asks what the detections are worth if it is so good."""
 
     frame_model: FrameModel | None = None
     """Model of a frame's detections, once the map has been associated."""

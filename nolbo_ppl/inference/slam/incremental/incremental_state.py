@@ -145,7 +145,7 @@ def load_state(slam: IncrementalMemory, path: str | PathLike[str]) -> None:
 
 
 def _get_population(archive: Npz) -> LatentPopulation:
-    """The population of latents; files of before 0.3 hold one Gaussian."""
+    """The population of latents; older files hold one Gaussian."""
     if "prior/population/mean" not in archive.names:
         return LatentPopulation.of_one(archive.array("prior/mean", (None,)), archive.array("prior/variance", (None,)))
     shapes = ((None,), (None, None), (None,))
