@@ -73,6 +73,15 @@ def base_graph(state: SlamState) -> gtsam.NonlinearFactorGraph:
     return measured_graph(state)[0]
 
 
+def distances_to_landmarks(state: SlamState) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Squared distance of each detection in the graph from its landmark at the estimate, in the sensor's covariance, and the log
+    determinant of that (of 2 pi times it, as `squared_distance`)."""
+    seen = state.measurements.select(state.rows)
+    T_camera_world = inverse(state.estimate.T_world_camera[seen.frame])
+    error = transform(T_camera_world, state.estimate.T_world_landmark[state.landmark, :3, 3]) - seen.position
+    return squared_distance(error, seen.covariance)
+
+
 def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     """Probability of each detection in the graph being its object rather than background, given the estimate.
 
@@ -80,9 +89,7 @@ def inlier_weights(state: SlamState) -> Float[np.ndarray, " k"]:
     gross errors leave the graph: by evidence, with weights frozen through the next M-step.
     """
     seen = state.measurements.select(state.rows)
-    T_camera_world = inverse(state.estimate.T_world_camera[seen.frame])
-    error = transform(T_camera_world, state.estimate.T_world_landmark[state.landmark, :3, 3]) - seen.position
-    log_object = seen.log_object + position_log_density(*squared_distance(error, seen.covariance), state.noise.position_dof)
+    log_object = seen.log_object + position_log_density(*distances_to_landmarks(state), state.noise.position_dof)
     log_background = seen.log_clutter + np.log(state.noise.clutter_intensity)
     return 1.0 / (1.0 + np.exp(np.clip(log_background - log_object, -500, 500)))
 

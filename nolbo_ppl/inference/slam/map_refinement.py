@@ -9,17 +9,16 @@ import gtsam
 import numpy as np
 from jaxtyping import Float, Int
 
-from nolbo_ppl.geometry.pose import inverse, transform
 from nolbo_ppl.inference.slam.clusters import frames_of_landmarks, join
 from nolbo_ppl.inference.slam.data_association import Associations, associate_detections, moving_detections, rates_report
 from nolbo_ppl.inference.slam.em import make_landmark_equalities
 from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
-from nolbo_ppl.inference.slam.gaussian import squared_distance
 from nolbo_ppl.inference.slam.graph import LandmarkEqualities, optimize
 from nolbo_ppl.inference.slam.initialise import (
     SlamState,
     base_graph,
+    distances_to_landmarks,
     first_estimate,
     inlier_weights,
     linearise_state,
@@ -39,8 +38,8 @@ BROKEN_LINK = 6.0
 """A link stretched to this many of its scales by the others is cut."""
 BROKEN_FACTOR = 6.0
 """Detections that are left so many of their scales from a landmark do not move it, whatever their marginals say."""
-CONSISTENT_ROUNDS = 3
-"""Solves in which such detections are sought, the last one included."""
+CONSISTENT_ROUNDS = 2
+"""Times that such detections are sought, and the map solved again without them."""
 SMALLEST_MARGINAL = 0.01
 """Associations of lower probability are left out of the map's M-step."""
 
@@ -132,15 +131,7 @@ def reassociate(state: SlamState, rng: np.random.Generator) -> tuple[SlamState, 
     features = tracklet_features(
         state.measurements, state.config, state.prior, rows, landmark, weight, len(state.estimate.T_world_landmark)
     )
-    state = replace(state, rows=rows, landmark=landmark, weight=weight, features=features, frame_model=found.model)
-    return state, found
-
-
-def _stretch(state: SlamState) -> Float[np.ndarray, " k"]:
-    """Distance of each detection in the graph from its landmark as it stands, in the sensor's scales."""
-    seen = state.measurements.select(state.rows)
-    local = transform(inverse(state.estimate.T_world_camera[seen.frame]), state.estimate.T_world_landmark[state.landmark, :3, 3])
-    return np.sqrt(squared_distance(local - seen.position, seen.covariance)[0])
+    return replace(state, rows=rows, landmark=landmark, weight=weight, features=features, frame_model=found.model), found
 
 
 def solve_soft(state: SlamState, tolerance: float = 1e-8) -> SlamState:
@@ -175,12 +166,13 @@ def solve_consistent(state: SlamState, factors: tuple[float, float] = (1.0, 1.0)
     A place known to metres may well be that of a near detection six metres off, known to centimetres; but if it is not, no other
     factor holds the landmark, and with it the trajectory, against it (2 m of error became 16 in one solve).
     """
-    for _ in range(CONSISTENT_ROUNDS):
-        solved = solve_settled(state, factors)
-        far = (_stretch(solved) > BROKEN_FACTOR) & (state.weight > 0)
-        if leaves_odometry(state) or not far.any():
+    solved = solve_settled(state, factors)
+    for _ in range(CONSISTENT_ROUNDS if not leaves_odometry(state) else 0):
+        far = (distances_to_landmarks(solved)[0] > BROKEN_FACTOR**2) & (state.weight > 0)
+        if not far.any():
             break
         state = replace(state, weight=np.where(far, 0.0, state.weight))
+        solved = solve_settled(state, factors)
     return solved
 
 

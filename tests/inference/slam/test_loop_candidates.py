@@ -7,11 +7,18 @@ from dataclasses import replace
 import networkx
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal, norm
 
 from nolbo_ppl.inference.slam import SlamConfig
 from nolbo_ppl.inference.slam.clusters import join
-from nolbo_ppl.inference.slam.consistent_cliques import close_constellations, find_loop_closure, joint_log_density, windows
+from nolbo_ppl.inference.slam.consistent_cliques import (
+    LoopClosure,
+    close_constellations,
+    find_loop_closure,
+    joint_log_density,
+    windows,
+)
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior
 from nolbo_ppl.inference.slam.graph import LandmarkEqualities, SlamEstimate
 from nolbo_ppl.inference.slam.latent_population import LatentPopulation
@@ -20,6 +27,7 @@ from nolbo_ppl.inference.slam.loop_candidates import (
     PosteriorSamples,
     TrackletFeatures,
     candidate_pairs,
+    feature_log_ratio,
     log_population,
 )
 
@@ -86,6 +94,23 @@ def test_tracklets_seen_together_are_no_pair() -> None:
     assert {(int(a), int(b)) for a, b in zip(found.a, found.b)} == {(2, 0), (2, 1)}
 
 
+def test_parallel_neighbours_are_no_evidence() -> None:
+    """What stands along a road has one heading there: agreeing in it is worth at most the log of two, elsewhere more."""
+    rng = np.random.default_rng(5)
+    road, apart = 40, 60
+    position = np.zeros((road + apart, 3))
+    position[:road, 0], position[road:, 0] = 3.0 * np.arange(road), 1000 + 3.0 * np.arange(apart)
+    turn = np.concatenate([0.02 * rng.standard_normal(road), rng.uniform(-np.pi, np.pi, apart)])
+    turn[road] = turn[road + 20]  # one pair of objects that happen to agree
+    T = poses(position)
+    T.T_world_landmark[:, :3, :3] = Rotation.from_rotvec(turn[:, None] * [0, 0, 1]).as_matrix()
+    found = replace(features(road + apart), oriented=np.ones(road + apart, bool))
+    a, b = np.array([20, road + 20]), np.array([2, road])
+    ratio = feature_log_ratio(T, still(road + apart), found, PRIOR, SlamConfig(), a, b)
+    assert 0.0 < ratio[0] < np.log(2.0) + 0.05
+    assert ratio[1] > 1.5
+
+
 def test_joint_density_of_a_group_equals_the_dense_normal() -> None:
     """Drift of six directions common to all gaps plus a part of each one's own."""
     rng = np.random.default_rng(2)
@@ -112,7 +137,7 @@ def second_pass(shift: np.ndarray, wrong: np.ndarray | None = None) -> tuple[np.
     return np.concatenate(parts), PosteriorSamples(deviation, 0 * deviation), rng
 
 
-def closing(position: np.ndarray, samples: PosteriorSamples) -> tuple[object, int]:
+def closing(position: np.ndarray, samples: PosteriorSamples) -> tuple[LoopClosure | None, int]:
     m = len(position)
     first = np.concatenate([np.arange(m - 6), np.full(6, 1000)])
     config = SlamConfig()
@@ -124,11 +149,11 @@ def closing(position: np.ndarray, samples: PosteriorSamples) -> tuple[object, in
 def test_constellation_is_found_and_twins_are_refused() -> None:
     position, samples, _ = second_pass(np.array([3.0, 0.1, -2.0]))
     found, m = closing(position, samples)
-    assert found is not None and sorted(zip(found.a.tolist(), found.b.tolist())) == [(m - 6 + i, i) for i in range(6)]  # type: ignore[attr-defined]
+    assert found is not None and sorted(zip(found.a.tolist(), found.b.tolist())) == [(m - 6 + i, i) for i in range(6)]
     config = SlamConfig()
-    assert found.margin > config.clique_log_odds  # type: ignore[attr-defined]
+    assert found.margin > config.clique_log_odds
     twins, _ = closing(*second_pass(np.array([3.0, 0.1, -2.0]), wrong=np.array([5.0, 0.2, -3.5]))[:2])
-    assert twins is not None and twins.margin < config.clique_log_odds / 2  # type: ignore[attr-defined]
+    assert twins is not None and twins.margin < config.clique_log_odds / 2
 
 
 def test_closings_use_no_tracklet_twice() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.pose import inverse, se3_exp, transform
+from nolbo_ppl.inference.association import Associator
 from nolbo_ppl.inference.slam import SlamConfig, SlamProblem, loop_candidates, near_pairs
 from nolbo_ppl.inference.slam import frame_marginals as frames_module
 from nolbo_ppl.inference.slam.detection_features import FeaturePrior, fit_prior
@@ -59,14 +60,14 @@ def random_frames(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("associator", ["exact", "softmax", "hungarian"])
-def test_a_frame_in_parts_is_the_whole_frame(associator: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_in_parts_is_the_whole_frame(associator: Associator, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         problem = random_frames(rng)
-        whole = frame_marginals(*problem, associator=associator)  # type: ignore[arg-type]
+        whole = frame_marginals(*problem, associator=associator)
         with monkeypatch.context() as patch:
             patch.setattr(frames_module, "SMALL_MATRIX", 0)
-            parts = frame_marginals(*problem, associator=associator)  # type: ignore[arg-type]
+            parts = frame_marginals(*problem, associator=associator)
         for name in ("weight", "null", "log_evidence"):
             np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-10)
         assert parts.exact == whole.exact

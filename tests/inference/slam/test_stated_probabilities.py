@@ -19,10 +19,12 @@ from nolbo_ppl.inference.slam.detection_features import fit_prior
 from nolbo_ppl.inference.slam.detection_pairs import detection_pairs
 from nolbo_ppl.inference.slam.exposures import exposures_of
 from nolbo_ppl.inference.slam.frame_model import initial_frame_model
+from nolbo_ppl.inference.slam.graph import to_values
 from nolbo_ppl.inference.slam.initialise import base_graph
 from nolbo_ppl.inference.slam.linearisation import linearise
 from nolbo_ppl.inference.slam.measurements import resolve
 from nolbo_ppl.inference.slam.noise.noise_estimation import estimate_noise
+from nolbo_ppl.inference.slam.slam_state import SlamState
 from nolbo_ppl.io.observations import Detections
 
 CONFIG = SlamConfig(odometry_rotation_scale=0.01, odometry_translation_ratio=0.01)
@@ -225,10 +227,8 @@ def test_a_detection_is_judged_without_itself() -> None:
         assert pairs.log_position[pair] == pytest.approx(expected, abs=0.15)
 
 
-def state_values(state: object) -> gtsam.Values:
-    from nolbo_ppl.inference.slam.graph import to_values
-
-    return to_values(state.estimate)  # type: ignore[attr-defined]
+def state_values(state: SlamState) -> gtsam.Values:
+    return to_values(state.estimate)
 
 
 def test_samples_are_of_the_posterior(worlds: list[tuple[SimulatedSequence, SlamResult]]) -> None:

@@ -287,7 +287,7 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
     """One update of the odometry's scales to the fixed point of the evidence: `sigma^2 <- sigma^2 sum r^2 / sum E[r^2]`.
 
     Scales nobody stated go up and down where `MIN_STATED` steps tell them. Stated ones stay unless they are too small by more
-    than a third (reported, and raised with `correct_scales`).
+    than a third (reported, and raised with `correct_scales`). Of kept odometry, translations get no looser than was said.
     """
     if len(state.problem) < 3 or not len(state.rows):
         return state
@@ -300,7 +300,7 @@ def refine_odometry(state: SlamState, linearisation: Linearisation) -> SlamState
         if told < MIN_STATED:
             continue
         ratio = float(np.clip(np.sqrt(squared), 1 / LARGEST_CHANGE, LARGEST_CHANGE))
-        if state.odometry_kept and name == "translation":  # no looser than was said
+        if state.odometry_kept and name == "translation":
             said = step_sigmas(state.problem, state.config)[1]
             ratio = min(ratio, float(np.median(said / state.noise.translation_step)))
         if not stated_sigmas(state.problem, state.config)[axis]:

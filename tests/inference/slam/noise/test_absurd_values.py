@@ -76,9 +76,9 @@ def test_modes_are_bounded() -> None:
         ("odometry_rotation_scale", True),
     ],
 )
-def test_settings_are_checked(name: str, value: object) -> None:
+def test_settings_are_checked(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=name):
-        SlamConfig(**{name: value})  # type: ignore[arg-type]
+        SlamConfig(**{name: value})
 
 
 def test_good_odometry_is_not_bent_by_poor_detections() -> None:
