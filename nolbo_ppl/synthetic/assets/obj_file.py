@@ -28,7 +28,8 @@ class ObjMesh:
 
 
 def read_obj(path: Path) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and triangles of every object of a file; polygons are split into fans, materials and lines are passed over.
+    """Vertices and triangles of every object of a file; polygons are split into fans, materials and lines are passed over,
+    faces of one or two vertices too, as modellers write the edges that bound no surface.
 
     A negative index counts back from the last vertex read where the face stands, as exporters of several parts write;
     resolving it at the end of the file (as trimesh 4 and 5 do) turns every part into the last.
@@ -85,13 +86,13 @@ def parse_obj(text: str, path: Path) -> ObjMesh:
                 continue
             corners = [int(word.split("/", 1)[0]) for word in words[1:]]
             corners = [k + len(vertices) if k < 0 else k - 1 for k in corners]
-            if len(corners) < 3 or not all(0 <= k < len(vertices) for k in corners):
+            if not corners or not all(0 <= k < len(vertices) for k in corners):
                 raise ValueError
         except ValueError:
             raise input_error(
                 "not a vertex or face of an OBJ file",
                 got=repr(line[:60]),
-                expected="v x y z, or f with three or more numbers of vertices",
+                expected="v x y z, or f with numbers of vertices read before",
                 file=path,
                 line=number,
             ) from None

@@ -115,6 +115,9 @@ def test_obj_counts_from_either_end_of_what_was_read(tmp_path: Path) -> None:
     one, two = load_cad_folder(tmp_path)
     assert voxel_iou(one.voxels(32), two.voxels(32)) == 1.0
     np.testing.assert_array_equal(read_obj(tmp_path / "chair_a.obj")[1], read_obj(tmp_path / "chair_b.obj")[1])
+    (tmp_path / "chair_edges.obj").write_text(absolute + "f 1 2\nf 3\nl 1 2 3\n")  # as modellers write edges without a surface
+    np.testing.assert_array_equal(read_obj(tmp_path / "chair_a.obj")[1], read_obj(tmp_path / "chair_edges.obj")[1])
+    (tmp_path / "chair_edges.obj").unlink()
     (tmp_path / "chair_c.obj").write_text("v 0 0 0\nv 1 0 0\nf -1 -2 -3\n")
     with pytest.raises(InputError, match=r"chair_c\.obj:3: not a vertex or face of an OBJ file: got 'f -1 -2 -3'"):
         load_cad_folder(tmp_path)
