@@ -46,8 +46,15 @@ def image_levels(image: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, ...]:
     """The image, and its means over blocks of 2, 4, ... px."""
     levels = [image]
     while len(levels) < LEVELS and min(levels[-1].shape[2:]) >= 2:
-        levels.append(torch.nn.functional.avg_pool2d(levels[-1], 2))
+        levels.append(_halved(levels[-1]))
     return tuple(levels)
+
+
+def _halved(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h2 w2"]:
+    """Means over blocks of 2 x 2 px; torch's pooling of so few channels takes five times as long on a CPU."""
+    height, width = (side // 2 * 2 for side in image.shape[2:])
+    rows = image[:, :, 0:height:2] + image[:, :, 1:height:2]
+    return (rows[..., 0:width:2] + rows[..., 1:width:2]) * 0.25
 
 
 def cut_out(

@@ -247,3 +247,13 @@ def test_levels_of_predictions() -> None:
     found = YoloxNano().double()(torch.zeros(1, 3, 64, 96))
     assert found.box.shape == (1, 8 * 12 + 4 * 6 + 2 * 3, 4)
     assert found.classes.shape[-1] == 80 and found.features.shape[-1] == 128
+
+
+@pytest.mark.parametrize("sides", [(64, 96), (37, 50)])
+def test_levels_are_means_over_blocks(sides: tuple[int, int]) -> None:
+    image = torch.randn(2, 3, *sides, generator=torch.Generator().manual_seed(0))
+    for number, level in enumerate(image_levels(image)):
+        expected = image
+        for _ in range(number):
+            expected = torch.nn.functional.avg_pool2d(expected, 2)
+        torch.testing.assert_close(level, expected)

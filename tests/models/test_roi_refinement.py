@@ -155,3 +155,13 @@ def test_details_are_sampled_twice_as_densely() -> None:
     corners = [points + offset * torch.tensor([a, b]) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     expected = sum(sample_map(fine, row, c.flatten(1, 2), 4)[..., 0] for c in corners) / 4
     torch.testing.assert_close(seen[0], expected.view(1, 1, side, side).expand(1, width, side, side))
+
+
+@pytest.mark.parametrize(("images", "rows"), [(1, [0, 0, 0]), (3, [0, 1, 2]), (2, [1, 0, 1]), (3, [2, 0])])
+def test_queries_sample_what_training_does(images: int, rows: list[int]) -> None:
+    g = torch.Generator().manual_seed(0)
+    maps, row = torch.randn(images, 5, 6, 9, generator=g), torch.tensor(rows)
+    points = 90 * torch.rand(len(rows), 40, 2, generator=g) - 10  # some beyond the border
+    trained = sample_map(maps, row, points, 8)
+    with torch.no_grad():
+        torch.testing.assert_close(sample_map(maps, row, points, 8), trained, atol=1e-10, rtol=1e-10)

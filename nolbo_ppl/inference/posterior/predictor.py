@@ -19,7 +19,7 @@ from nolbo_ppl.errors import input_error
 from nolbo_ppl.geometry.boxes import boxes_in_image, suppress
 from nolbo_ppl.inference.posterior.decode import SelectedRegions, assemble
 from nolbo_ppl.inference.posterior.decoded_shapes import DecodedShape, decode_latents, extents, sampled_shapes
-from nolbo_ppl.inference.posterior.folded_networks import FoldedNetworks
+from nolbo_ppl.inference.posterior.folded_networks import FoldedNetworks, NetworksOfQueries
 from nolbo_ppl.inference.posterior.metric_size import MetricKnowledge, shape_hulls
 from nolbo_ppl.inference.posterior.preprocess import Image as Image
 from nolbo_ppl.inference.posterior.preprocess import PreprocessedImage, as_sequence, preprocess_all, same_shape
@@ -133,8 +133,8 @@ class ObservationModel:
         if not 0 < threshold < 1:
             raise input_error("threshold of the objectness", got=threshold, expected="a probability between 0 and 1")
 
-        def detect(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
-            return *self._detections(encoding, logit, threshold, iou_threshold), None
+        def detect(networks: NetworksOfQueries, encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
+            return *self._detections(networks, encoding, logit, threshold, iou_threshold), None
 
         results = self._observe(prepared, detect, decode, samples, seed, batch)
         return results[0] if single else results
@@ -168,22 +168,24 @@ class ObservationModel:
             height, width = image.image.shape[-2:]
             checked.append(boxes_in_image(given, (round(width / image.scale[0]), round(height / image.scale[1])), i))
 
-        def responsible(encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
+        def responsible(networks: NetworksOfQueries, encoding: Encoding, logit: Tensor, group: list[int]) -> Found:
             scaled = [checked[i] * np.tile(prepared[i].scale, 2) for i in group]
             row = torch.from_numpy(np.repeat(np.arange(len(group)), [len(part) for part in scaled]))
             box = torch.as_tensor(np.concatenate(scaled), dtype=logit.dtype)
             at = self.device
-            region = self._networks.guide.responsible_region(encoding, row.to(at), box.to(at)).cpu()
+            region = networks.guide.responsible_region(encoding, row.to(at), box.to(at)).cpu()
             return row, region, logit[row, region], box
 
         return self._observe(prepared, responsible, decode, samples, seed, batch)
 
     @torch.inference_mode()
-    def encode(self, image: UInt8[Tensor, "b 3 h w"], detail: Detail | None = None) -> Encoding:
+    def encode(
+        self, image: UInt8[Tensor, "b 3 h w"], detail: Detail | None = None, networks: NetworksOfQueries | None = None
+    ) -> Encoding:
         """The network's forward pass over a batch of prepared images, and the same larger where there are any."""
         at = self.device
         larger = None if detail is None else Detail(detail.image.to(at), detail.factor.to(at))
-        return self._networks.guide.encode(image.to(at), larger)
+        return (networks or self._networks.current()).guide.encode(image.to(at), larger)
 
     def _decoded(self, latent: Float[Tensor, "n d"]) -> Float[Tensor, "n v v v"]:
         """Log odds of the voxels of latents."""
@@ -193,7 +195,7 @@ class ObservationModel:
     def _observe(
         self,
         prepared: list[PreprocessedImage],
-        find: Callable[[Encoding, Tensor, list[int]], Found],
+        find: Callable[[NetworksOfQueries, Encoding, Tensor, list[int]], Found],
         decode: bool,
         samples: int,
         seed: int,
@@ -204,21 +206,23 @@ class ObservationModel:
         The networks run where they are. What is chosen of their output, a few numbers an object, is brought to the CPU and
         answered there, in double precision where the formulas want it, which not every device has.
         """
-        shapes = self._shapes(decode, samples, seed)
+        networks = self._networks.current()  # looked for changed weights once, not at every use
+        shapes = self._shapes(networks, decode, samples, seed)
         results: dict[int, ObjectPosteriors] = {}
         for group in same_shape(prepared, batch):
-            encoding = self.encode(torch.stack([prepared[i].image for i in group]), detail_of([prepared[i] for i in group]))
+            images = torch.stack([prepared[i].image for i in group])
+            encoding = self.encode(images, detail_of([prepared[i] for i in group]), networks)
             shift = None if encoding.shift is None else encoding.shift.cpu()
             logit = self.calibration.objectness(encoding.objectness_logit.cpu())
             if shift is not None:
                 logit = logit - ODDS_PER_SHIFT * excess(shift)[:, None]
-            row, region, odds, look_at = find(encoding, logit, group)
+            row, region, odds, look_at = find(networks, encoding, logit, group)
             camera = torch.stack([prepared[i].camera for i in group])[row]
             scale = np.stack([prepared[i].scale for i in group])[row.numpy()]
-            q = self._parameters(encoding, row, region, look_at)
+            q = self._parameters(networks, encoding, row, region, look_at)
             if shift is not None:
                 q = q.widened(1 + SCALE_PER_SHIFT * excess(shift)[row])
-            known = self._metric_knowledge(encoding, row, [prepared[i] for i in group])
+            known = self._metric_knowledge(networks, encoding, row, [prepared[i] for i in group])
             regions = SelectedRegions(q, region, encoding.columns, odds, camera, scale, known)
             answer = assemble(regions, self.config, self._prior, self._prior_mean, shapes)
             ends = np.searchsorted(row.numpy(), np.arange(len(group) + 1))
@@ -230,23 +234,28 @@ class ObservationModel:
                 results[i] = one if shift is None else replace(one, shift=float(shift[k]))
         return [results[i] for i in range(len(prepared))]
 
-    def _shapes(self, decode: bool, samples: int, seed: int) -> Callable[[RegionParameters, Tensor], DecodedShape]:
+    def _shapes(
+        self, networks: NetworksOfQueries, decode: bool, samples: int, seed: int
+    ) -> Callable[[RegionParameters, Tensor], DecodedShape]:
         """Shapes of regions from their posterior and diagonals, m."""
+
+        def decoded(latent: Float[Tensor, "n d"]) -> Float[Tensor, "n v v v"]:
+            return networks.decoder(latent.to(self.device))
 
         def shapes(q: RegionParameters, diagonal: Tensor) -> DecodedShape:
             metres = diagonal.numpy()
             if not decode:
                 return DecodedShape(None, None, self._category_extents[q.label_logits.argmax(-1)] * metres[:, None])
             side = self.config.voxel_size
-            return sampled_shapes(self._decoded, side, q.shape_loc, q.shape_scale, metres, samples, seed)
+            return sampled_shapes(decoded, side, q.shape_loc, q.shape_scale, metres, samples, seed)
 
         return shapes
 
     def _metric_knowledge(
-        self, encoding: Encoding, row: Int[Tensor, " n"], images: Sequence[PreprocessedImage]
+        self, networks: NetworksOfQueries, encoding: Encoding, row: Int[Tensor, " n"], images: Sequence[PreprocessedImage]
     ) -> MetricKnowledge | None:
         """What else tells sizes and distances of objects in these images; None for models that know no photographs."""
-        guide = self._networks.guide
+        guide = networks.guide
         if encoding.generated is None or not isinstance(guide, HybridGuide):
             return None
         return MetricKnowledge(
@@ -263,21 +272,28 @@ class ObservationModel:
         return preprocess_all(images, intrinsics, size, self._prior_mean.dtype, cuts_out)
 
     def _parameters(
-        self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"], box: Float[Tensor, "n 4"] | None
+        self,
+        networks: NetworksOfQueries,
+        encoding: Encoding,
+        row: Int[Tensor, " n"],
+        region: Int[Tensor, " n"],
+        box: Float[Tensor, "n 4"] | None,
     ) -> RegionParameters:
         at = self.device
         look_at = None if box is None else box.to(at)
-        q = self._networks.guide.parameters_at(encoding, row.to(at), region.to(at), box=look_at).map(Tensor.cpu)
+        q = networks.guide.parameters_at(encoding, row.to(at), region.to(at), box=look_at).map(Tensor.cpu)
         return self.calibration.apply(q.at_map_category(self._prior_mean))
 
-    def _boxes(self, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]) -> Float[Tensor, "n 4"]:
+    def _boxes(
+        self, networks: NetworksOfQueries, encoding: Encoding, row: Int[Tensor, " n"], region: Int[Tensor, " n"]
+    ) -> Float[Tensor, "n 4"]:
         """Boxes of regions, px of the scaled image; no RoI refinement is needed for them."""
         at = self.device
-        q = self._networks.guide.parameters_at(encoding, row.to(at), region.to(at), look=False)
+        q = networks.guide.parameters_at(encoding, row.to(at), region.to(at), look=False)
         return decode_box(q.box_loc.cpu(), region // self.config.predictors, encoding.columns, self.config)
 
     def _detections(
-        self, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float
+        self, networks: NetworksOfQueries, encoding: Encoding, logit: Tensor, threshold: float, iou_threshold: float
     ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, " n"]]:
         """Row, region and log odds of the objects above the threshold, best first in a row.
 
@@ -289,7 +305,7 @@ class ObservationModel:
         row, region = (logit > math.log(least / (1 - least))).nonzero(as_tuple=True)
         if len(region) == 0:
             return row, region, logit.new_empty(0)
-        box = self._boxes(encoding, row, region)
+        box = self._boxes(networks, encoding, row, region)
         kept, stands_for = suppress(box, logit[row, region], iou_threshold, group=row)
         probability = torch.sigmoid(logit[row, region].double())
         if not self.config.detector:

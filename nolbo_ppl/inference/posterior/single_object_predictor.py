@@ -97,7 +97,8 @@ class SingleObjectModel(ObservationModel):
         """Posterior of each box, from its crop; `seen` are images with their intrinsics, px."""
         results = []
         dtype, side, at = self._prior_mean.dtype, self.config.image_size, self.device
-        shapes = self._shapes(decode, samples, seed)
+        networks = self._networks.current()
+        shapes = self._shapes(networks, decode, samples, seed)
         for (image, camera), given, certainty in zip(seen, boxes, objectness):
             pixels = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
             box = torch.as_tensor(np.asarray(given).reshape(-1, 4), dtype=dtype)
@@ -107,9 +108,9 @@ class SingleObjectModel(ObservationModel):
             for first in range(0, max(len(box), 1), 4 * batch):
                 part = slice(first, first + 4 * batch)
                 rows = torch.arange(len(box[part]), device="cpu")
-                encoding = self.encode(crops.image[part] if len(box) else pixels.new_zeros((1, 3, side, side)))
-                numbers.append(self._networks.guide.responsible_region(encoding, rows.to(at), local[part].to(at)).cpu())
-                found.append(self._parameters(encoding, rows, numbers[-1], local[part]))
+                encoding = self.encode(crops.image[part] if len(box) else pixels.new_zeros((1, 3, side, side)), networks=networks)
+                numbers.append(networks.guide.responsible_region(encoding, rows.to(at), local[part].to(at)).cpu())
+                found.append(self._parameters(networks, encoding, rows, numbers[-1], local[part]))
             regions = SelectedRegions(
                 RegionParameters.concatenate(found),
                 torch.cat(numbers),

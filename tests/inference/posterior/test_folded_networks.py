@@ -8,8 +8,16 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from torch import nn
 
-from nolbo_ppl.inference.posterior.folded_networks import FoldedDecoder, FoldedNetworks, folded_guide, kernel_type
+from nolbo_ppl.inference.posterior.folded_networks import (
+    FoldedDecoder,
+    FoldedNetworks,
+    folded_detector,
+    folded_guide,
+    kernel_type,
+    tensors_of,
+)
 from nolbo_ppl.models.hybrid_guide import HybridEncoding, HybridGuide
 from nolbo_ppl.models.model_config import ModelConfig
 from nolbo_ppl.models.observation_model import Nolbo
@@ -29,7 +37,7 @@ def model_of(config: ModelConfig, seed: int = 0) -> Nolbo:
     model = Nolbo.from_seed(config, seed).eval().requires_grad_(False)
     g = torch.Generator().manual_seed(seed)
     for module in model.modules():
-        if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
             assert module.running_mean is not None and module.running_var is not None
             module.running_mean.copy_(0.3 * torch.randn(module.running_mean.shape, generator=g))
             module.running_var.copy_(torch.exp(torch.randn(module.running_var.shape, generator=g)))
@@ -47,7 +55,7 @@ def picture(seed: int = 0) -> torch.Tensor:
 def test_a_folded_guide_answers_as_its_own(detector: str, shape_look: int) -> None:
     guide = model_of(tiny_config(detector=detector, shape_look=shape_look)).guide
     if guide.shape_look is not None:
-        torch.nn.init.normal_(guide.shape_look.judge[-1].weight, std=0.3)
+        nn.init.normal_(guide.shape_look.judge[-1].weight, std=0.3)
     fast = folded_guide(guide, torch.float32)
     region, row = torch.tensor([3, 8, 20]), torch.tensor([0, 1, 1])
     with torch.inference_mode():
@@ -89,3 +97,40 @@ def test_changed_weights_are_followed_and_others_run_as_they_are() -> None:
     double = FoldedNetworks(copy.deepcopy(model).double())
     assert double.decoder is double.model.story.decoder and double.guide is double.model.guide
     assert kernel_type() in (torch.float32, torch.bfloat16)
+
+
+def test_weights_replaced_moved_or_of_another_mode_are_followed() -> None:
+    model = model_of(tiny_config())
+    networks = FoldedNetworks(model)
+    before = networks.current()
+    assert networks.current() == before
+    head = model.guide.head.objectness
+    head.weight = nn.Parameter(head.weight + 1, requires_grad=False)  # replaced
+    assert networks.guide is not before.guide
+    before = networks.current()
+    head.weight.data = head.weight.data.clone()  # moved
+    assert networks.guide is not before.guide
+    before = networks.current()
+    model.guide.head.objectness = nn.Linear(head.in_features, head.out_features).requires_grad_(False)  # type: ignore[assignment]
+    assert networks.guide is not before.guide and networks.guide.head.objectness is model.guide.head.objectness
+    before = networks.current()
+    next(iter(model.guide.encoder.buffers())).add_(0.1)  # written, a running mean
+    assert networks.guide is not before.guide and networks.decoder is not before.decoder
+    model.train()
+    assert networks.guide is model.guide
+    model.eval()
+    assert networks.guide is not model.guide
+
+
+def test_every_weight_is_looked_at() -> None:
+    model = model_of(tiny_config(detector="yolox_nano", shape_look=32))
+    expected = {id(one) for one in (*model.guide.parameters(), *model.guide.buffers())}
+    assert {id(one) for one in tensors_of(model.guide)} == expected
+
+
+def test_a_folded_detector_predicts_the_same() -> None:
+    guide = model_of(tiny_config(detector="yolox_nano")).guide
+    assert isinstance(guide, HybridGuide)
+    own, fast = guide.detector(picture().float()), folded_detector(guide.detector)(picture().float())
+    for name in ("box", "objectness", "classes", "features"):
+        torch.testing.assert_close(getattr(fast, name), getattr(own, name), atol=1e-3, rtol=1e-4, msg=name)
