@@ -176,6 +176,8 @@ def verbs_of(given: Path) -> list[tuple[Verb, str]]:
                     seen[1],
                     "--odometry",
                     str(poses),
+                    "--model",
+                    "tiny",
                     "--test-sizes",
                     "128",
                     "--score-threshold",

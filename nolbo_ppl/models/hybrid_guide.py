@@ -1,10 +1,10 @@
 """The guide of photographs: evidence of a detector and of the scene network, and RoI refinement of each object, cut out.
 
 One amortised posterior with the sites of every guide. The image goes once through a frozen detector and, at half its size,
-through the guide's own encoder and head; their predictions are evidence about the same regions (`evidence`). Objects are then
-cut out at one size and sent through encoder, head and RoI refinement again (`crops`): viewpoint, shape and range come from
-there, category from both. In evaluation mode the mirror image of each object is looked at too: the azimuth's posterior is the
-mean of both.
+through a frozen network that knows generated scenes (`scene_network`); their predictions are evidence about the same regions
+(`evidence`). Objects are then cut out at one size and sent through the guide's own encoder, head and RoI refinement
+(`crops`): viewpoint, shape and range come from there, category from both. In evaluation mode the mirror image of each object
+is looked at too: the azimuth's posterior is the mean of both.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from nolbo_ppl.models.normalisation import SyncBatchNorm2d
 from nolbo_ppl.models.observed_scene import Detail, Encoding, ObservedScene, RegionParameters
 from nolbo_ppl.models.prior import LabelPrior
 from nolbo_ppl.models.scene_batch import Assignment, SceneBatch, cell_of, decode_box, encode_box, encode_range
+from nolbo_ppl.models.scene_network import SceneNetwork
 from nolbo_ppl.models.yolox import WIDTH, YoloxNano
 
 REDUCTION = 2
@@ -53,8 +54,6 @@ class GatheredEvidence:
     scene: Evidence
     context: Float[Tensor, "b c"]
     """What describes each image as a whole: mean features of both networks."""
-    features: Float[Tensor, "b cells c"]
-    """Features of the scene network's cells."""
     rows: int
     columns: int
     levels: tuple[Float[Tensor, "b 3 _ _"], ...]
@@ -67,7 +66,8 @@ class HybridGuide(Guide):
     def __init__(self, config: ModelConfig, prior: LabelPrior) -> None:
         super().__init__(config, prior)
         self.detector = YoloxNano()
-        self.fusion = Fusion(2 * WIDTH, self.encoder.channels + 2 * WIDTH, config)
+        self.scene = SceneNetwork(config)
+        self.fusion = Fusion(self.encoder.channels + 2 * WIDTH, config)
         self.shift = ImageShift(self.encoder.channels + 2 * WIDTH)
         self.sizes = CategorySizes(len(config.categories))
 
@@ -93,23 +93,12 @@ class HybridGuide(Guide):
         colours = image.to(dtype).contiguous(memory_format=torch.channels_last)
         rows, columns = image.shape[2] // config.stride, image.shape[3] // config.stride
         levels = image_levels(normalise_image(colours, dtype))
-        with self._autocast():
-            with torch.no_grad():
-                predictions = self.detector(colours)
-            maps, _ = self.encoder(levels[1].contiguous(memory_format=torch.channels_last))
-            features = maps.flatten(2).transpose(1, 2)
-            raw = self.head(features)
-            logit = self.head.objectness(features)
-        raw, logit = raw.to(dtype), logit.to(dtype)
-        cell = torch.arange(raw.shape[1], device=raw.device)[:, None].expand(-1, config.predictors)
-        box = REDUCTION * decode_box(self.head.box_latent(raw), cell, maps.shape[3], config).flatten(1, 2)
-        labels = torch.log_softmax(raw[..., : self.head.sizes[0]], -1).flatten(1, 2)
-        nothing = labels.new_zeros(*labels.shape[:2], 0)
+        with self._autocast(), torch.no_grad():
+            predictions, scene = self.detector(colours), self.scene(levels[1])
         return GatheredEvidence(
             detector_evidence(predictions, rows, columns, config),
-            gather_evidence(box, logit.flatten(1), labels, nothing, rows, columns, config),
-            torch.cat((features.mean(1).to(dtype), predictions.features.mean(1)), -1),
-            features,
+            gather_evidence(REDUCTION * scene.box, scene.log_odds, scene.labels, rows, columns, config),
+            torch.cat((scene.features, predictions.features.mean(1)), -1),
             rows,
             columns,
             levels,
@@ -128,7 +117,8 @@ class HybridGuide(Guide):
         levels, factor = one.levels, None
         if detail is not None:
             levels, factor = image_levels(normalise_image(detail.image, logit.dtype)), detail.factor
-        whole = (one.features, logit, one.rows, one.columns, (), shift, generated)
+        nothing = logit.new_zeros(len(image), 0, 0)
+        whole = (nothing, logit, one.rows, one.columns, (), shift, generated)
         return HybridEncoding(*whole, levels, factor, fused=fused, box=box)
 
     def parameters_at(

@@ -49,8 +49,8 @@ class RunConfig:
     """True trajectory, for errors, and for the lengths of visual odometry where nothing else gives them."""
     truth_objects: Path | None = field(default=None, metadata=affects("figures", "drive"))
     """Folder of a drive (`nolbo drive`), for figures against its true objects."""
-    model: str = field(default="tiny", metadata=affects("observe", "model"))
-    """Observation model: name of weights in the package, or a folder."""
+    model: str = field(default="photo", metadata=affects("observe", "model"))
+    """Observation model: `photo` for pictures of the world, `tiny` for generated drives, or a folder."""
     device: str = field(default="auto", metadata=affects(None))
     """Where its networks run: `auto`, `cpu`, `cuda`, `cuda:N` or `mps`."""
     online: bool = field(default=False, metadata=affects("slam"))

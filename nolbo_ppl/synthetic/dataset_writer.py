@@ -25,6 +25,8 @@ CHUNK = 128
 """Scenes that one job renders."""
 SCENES = "scenes.jsonl"
 """Written last: a folder that has it is complete."""
+DRIVE = "drive.json"
+"""What a rendered drive was made of, in its folder."""
 
 
 def _write_chunk(source: SceneGenerator, out: Path, first: int, last: int) -> int:
@@ -89,6 +91,17 @@ def _write(out: Path, source: SceneGenerator, count: int, workers: int) -> dict[
     rows = [row for _, row in read_jsonl(out / SCENES)]
     objects = [thing for row in rows for thing in row["objects"]]
     return {"scenes": len(rows), "objects": len(objects), "instances": len({o["instance"] for o in objects})}
+
+
+def is_generated(folder: str | os.PathLike[str]) -> bool:
+    """Whether a folder of scenes, or of a drive, was rendered here; photographs, and scenes of other origin, were not."""
+    if (Path(folder) / DRIVE).is_file():
+        return True
+    made = Path(folder) / "source.json"
+    if not made.is_file():
+        return False
+    described = read_json(made)
+    return isinstance(described, dict) and {"config", "seed"} <= described.keys()
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
+from nolbo_ppl.models.scene_network import scene_weights_of
 from nolbo_ppl.training.detector_file import read_detector
 
 LOOK = "guide.shape_look."
@@ -29,7 +30,8 @@ def adopt(model: Nolbo, initial: Nolbo, detector: str | os.PathLike[str] | None)
     if model.config.detector and not initial.config.detector:
         if detector is None:
             raise input_error("the preset photo without a detector", do="give --detector yolox_nano.onnx")
-        state = {**model.state_dict(), **state}
+        own_state = model.state_dict()
+        state = {**own_state, **state, **scene_weights_of(state, list(own_state))}
     model.load_state_dict(state)
     if detector is not None:
         model.guide.get_submodule("detector").load_state_dict(read_detector(detector).state_dict())

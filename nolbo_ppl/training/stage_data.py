@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.distributed as distributed
-from jaxtyping import Bool
+from jaxtyping import Bool, Int, UInt8
 
 from nolbo_ppl.data.augment import Augmentation
 from nolbo_ppl.data.dataset_folder import SceneFolder
@@ -20,6 +20,7 @@ from nolbo_ppl.devices import each_pinned
 from nolbo_ppl.errors import input_error
 from nolbo_ppl.models.observation_model import Nolbo
 from nolbo_ppl.models.scene_batch import SceneBatch
+from nolbo_ppl.synthetic.dataset_writer import is_generated
 from nolbo_ppl.synthetic.scenes.scene_config import SceneConfig, photographic, rendered_size
 from nolbo_ppl.synthetic.scenes.scene_config import preset as scene_preset
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
@@ -215,11 +216,22 @@ class TrainingData:
                     decode_order=seeded_noise(0, first + DECODE_STREAM, *batch.present.shape),
                 )
 
-    def plain_generated(self, most: int) -> Bool[torch.Tensor, " n"]:
-        """Which training scenes of `plain` are generated ones, in its order."""
-        sizes = [len(scenes) for scenes, _, _ in self._mix] or [len(self.train)]
-        kinds = [False] * len(self.config.scenes) + [True] * self.config.generated
+    def plain_generated(self, held_out: bool, most: int) -> Bool[torch.Tensor, " n"]:
+        """Which scenes of `plain` are generated ones, in its order."""
+        train = [scenes for scenes, _, _ in self._mix] or [self.train]
+        sizes = [len(scenes) for scenes in ([one for one, _ in self._held_out_mix] or [self._held_out] if held_out else train)]
+        kinds = [is_generated(path) for path in self.config.scenes] + [True] * self.config.generated
         return torch.tensor([kind for kind, size in zip(kinds, sizes) for _ in range(min(most, size))])
+
+    def plain_images(self, most: int) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """Training images of every data set, at most so many of each, as they were given: not brought to a square."""
+        for scenes in [scenes for scenes, _, _ in self._mix] or [self.train]:
+            part = scenes if isinstance(scenes, SceneSubset) else SceneSubset(scenes, np.arange(len(scenes)))
+            for index in part.index[evenly(len(part), most)]:
+                if isinstance(part.scenes, SceneFolder):
+                    yield part.scenes.image(int(index))
+                else:
+                    yield np.ascontiguousarray(part.scenes.batch(index[None])["image"][0].transpose(1, 2, 0))
 
     def plain(self, held_out: bool, most: int) -> Iterator[SceneBatch]:
         """Scenes of every data set of a mix as they are, at most so many of each, evenly spread over it.
@@ -232,7 +244,7 @@ class TrainingData:
         parts = self._held_out_mix or [(self._held_out, self._held_out_table)]
         for scenes, table in parts if held_out else [(scenes, table) for scenes, table, _ in train]:
             supply = SceneLoader(scenes, table, 16, 0, self.model.latent_dim, size=self.model.image_size)
-            chosen = np.unique(np.linspace(0, len(scenes) - 1, min(most, len(scenes))).round().astype(int))
+            chosen = evenly(len(scenes), most)
             for first in range(0, len(chosen), 16):
                 yield supply.prepared(chosen[first : first + 16])
 
@@ -244,6 +256,11 @@ class TrainingData:
             table.encode_shapes(model, mirrored=mirrored)
         if self._held_out_table is not self.table:
             self._held_out_table.encode_shapes(model)
+
+
+def evenly(count: int, most: int) -> Int[np.ndarray, " n"]:
+    """At most so many of the numbers below `count`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def shares(mix: Sequence[float], batch: int) -> list[int]:

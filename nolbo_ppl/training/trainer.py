@@ -45,6 +45,9 @@ from nolbo_ppl.training.train_config import TrainConfig as TrainConfig
 from nolbo_ppl.training.training_log import TrainingLogger, run_folder
 from nolbo_ppl.training.validation import validate
 
+DOMAIN_IMAGES = 300
+"""Images of each data set, at most, that teach what tells photographs from generated scenes, and how unlike an image is."""
+
 
 @dataclass
 class TrainSummary:
@@ -167,9 +170,10 @@ def weigh_evidence(model: Nolbo, data: TrainingData, config: TrainConfig) -> dic
         return table
 
     train, held_out = gathered(False), gathered(True)
-    generated = data.plain_generated(config.evidence_scenes)
-    terms = fit_fusion(model, train, held_out, generated, config.seed)  # on the CPU
-    context = train.context
+    kinds = [data.plain_generated(held, config.evidence_scenes) for held in (False, True)]
+    terms = fit_fusion(model, train, held_out, (kinds[0], kinds[1]), config.seed)  # on the CPU
+    images = progress_bar(data.plain_images(DOMAIN_IMAGES), "domains", "image")
+    context, generated = contexts_of(guide, images), data.plain_generated(False, DOMAIN_IMAGES)
     if config.unlabelled is not None:
         images = (open_image(path) for path in sorted(images_of(config.unlabelled, recursive=True)))
         more = contexts_of(guide, progress_bar(images, "unlabelled", "image"))
@@ -187,15 +191,16 @@ def fit_photographs(model: Nolbo, config: TrainConfig) -> dict[str, Any]:
     """
     if config.photographs is None:
         return {}
-    photos = read_photographs(config.photographs, categories=model.config.categories)[::PARTS]
-    made_of = {"file": str(config.photographs), "photographs": len(photos), "every": PARTS}
+    labelled = read_photographs(config.photographs, categories=model.config.categories)
+    photos, others = labelled[::PARTS], labelled[PARTS - 1 :: PARTS] or labelled[::PARTS]
+    made_of = {"file": str(config.photographs), "photographs": len(photos), "others": len(others), "every": PARTS}
     file = config.out / "photographs.json"
     if file.is_file():
         stored = read_json_object(file)
         if stored.get("made_of") == made_of:  # a run that is resumed need not look at them again
             adopt_fit(model, PhotographFit(**stored["fit"]))
             return stored["fit"]
-    fit = fit_found(find_objects(model, photos), photos)
+    fit = fit_found(find_objects(model, photos), photos, find_objects(model, others), others)
     if fit is None:
         return {}
     adopt_fit(model, fit)

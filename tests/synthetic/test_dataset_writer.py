@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+from nolbo_ppl.data.converters.photographs import convert_photographs, read_photographs
 from nolbo_ppl.data.dataset_folder import SceneFolder, letterbox
 from nolbo_ppl.errors import InputError
 from nolbo_ppl.geometry.camera import project
@@ -20,6 +21,7 @@ from nolbo_ppl.synthetic import dataset_writer as dataset
 from nolbo_ppl.synthetic.dataset_writer import write_scenes
 from nolbo_ppl.synthetic.scenes.scene_config import standard
 from nolbo_ppl.synthetic.scenes.scene_generator import SceneGenerator
+from tests.data.converters.test_photographs import write as labels
 
 COUNT = 10
 
@@ -72,6 +74,14 @@ def test_round_trip(source: SceneGenerator, written: Path) -> None:
     number, packed, category = folder.shapes()
     assert [folder.instances[n].split("-")[0] for n in number] == [folder.categories[c] for c in category]
     assert packed.shape == (len(folder.instances), 4096)
+
+
+def test_rendered_folders_are_told_from_others(written: Path, user: Callable[..., Path], tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "drive.json").write_text("{}")
+    assert dataset.is_generated(written) and dataset.is_generated(tmp_path / "drive")
+    convert_photographs(read_photographs(labels(tmp_path / "labels")), tmp_path / "photographs")
+    assert not dataset.is_generated(tmp_path / "photographs") and not dataset.is_generated(user(user_line()))
 
 
 def test_killed_run_is_resumed(source: SceneGenerator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

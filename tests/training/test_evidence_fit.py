@@ -52,22 +52,36 @@ def test_unlabelled_images_teach_positives_alone() -> None:
     assert torch.equal(table.known, table.is_object)
 
 
+ALL = torch.ones(3, dtype=torch.bool)
+
+
+def test_evidence_is_weighed_on_generated_scenes_alone() -> None:
+    """Photographs of which nothing is right teach the scenes' weights nothing; with none the result is the same."""
+    model, other = (Nolbo.from_seed(CONFIG, 0).double().eval() for _ in range(2))
+    scenes, photographs = gathered(model, 4, scenes=3), gathered(model, 5, scenes=3)
+    photographs.is_object.logical_not_()
+    both = join_tables([photographs, scenes])
+    kinds = torch.arange(6) >= 3
+    options = {"seed": 0, "steps": 20, "batch": 3, "learning_rate": 1e-2}
+    fit_fusion(model, both, both, (kinds, kinds), **options)
+    fit_fusion(other, scenes, scenes, (ALL, ALL), **options)
+    assert isinstance(model.guide, HybridGuide) and isinstance(other.guide, HybridGuide)
+    of_scenes = ("weigh.", "slopes", "shift")
+    expected = other.guide.fusion.state_dict()
+    for name, value in model.guide.fusion.state_dict().items():
+        if name.startswith(of_scenes):
+            torch.testing.assert_close(value, expected[name], rtol=1e-2, atol=1e-3)
+
+
 def test_the_fit_lowers_the_held_out_loss() -> None:
     """Objects are where chance put them, but objects there are: two in every image of known places."""
     model = Nolbo.from_seed(CONFIG, 0).double().eval()
     table = gathered(model, 4, scenes=3)
-    terms = fit_fusion(
-        model, table, table, torch.ones(3, dtype=torch.bool), seed=0, steps=40, batch=6, learning_rate=1e-2, weight_decay=0.0
-    )
+    terms = fit_fusion(model, table, table, (ALL, ALL), seed=0, steps=40, batch=6, learning_rate=1e-2, weight_decay=0.0)
     assert total(terms) < 0.7 * total({name: terms[f"{name}_before"] for name in WEIGHTS})
     assert isinstance(model.guide, HybridGuide)
     with torch.no_grad():
         kept = {name: float(value) for name, value in fusion_loss(model.guide.fusion, table).items()}
     assert kept == {name: terms[name] for name in WEIGHTS}  # the weights with the least loss are the model's
     again = Nolbo.from_seed(CONFIG, 0).double().eval()
-    assert (
-        fit_fusion(
-            again, table, table, torch.ones(3, dtype=torch.bool), seed=0, steps=40, batch=6, learning_rate=1e-2, weight_decay=0.0
-        )
-        == terms
-    )
+    assert fit_fusion(again, table, table, (ALL, ALL), seed=0, steps=40, batch=6, learning_rate=1e-2, weight_decay=0.0) == terms

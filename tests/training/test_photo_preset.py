@@ -72,7 +72,7 @@ def test_the_command_of_the_shipped_weights(tmp_path: Path, monkeypatch: pytest.
     looked: list[int] = []
     fitted = photograph_fit.PhotographFit(1.5, 0.5, 0.8, 0.0, 1, 60, 0.5, 0.4)
 
-    def fit_found(found: photograph_fit.FoundObjects, photos: list[Any]) -> photograph_fit.PhotographFit:
+    def fit_found(found: photograph_fit.FoundObjects, photos: list[Any], *_: object) -> photograph_fit.PhotographFit:
         looked.append(len(photos))
         return fitted
 

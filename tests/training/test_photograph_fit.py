@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def drawn(n: int, informative: bool, seed: int = 0) -> tuple[FoundObjects, list[
 
 @pytest.mark.parametrize("informative", [True, False])
 def test_the_numbers_behind_detections_are_found(informative: bool) -> None:
-    fit = fit_found(*drawn(4000, informative))
+    fit = fit_found(*drawn(4000, informative), *drawn(4000, informative, seed=1))
     assert fit is not None and fit.photographs == fit.detections == 4000
     assert fit.factor == pytest.approx(2.0, abs=0.35) and fit.shift == pytest.approx(-0.7, abs=0.3)  # 5 standard errors
     assert fit.label_factor == pytest.approx(0.6, abs=0.15)
@@ -63,13 +64,23 @@ def test_the_numbers_behind_detections_are_found(informative: bool) -> None:
         assert fit.look_share < 0.15
 
 
+def test_other_photographs_decide_on_the_look() -> None:
+    """A look that tells the categories of those it is fitted on, and misleads on others, has no share."""
+    found, photos = drawn(600, True)
+    others, other_photos = drawn(600, True, seed=1)
+    misled = dataclasses.replace(others, look=-others.look)
+    kept, dropped = fit_found(found, photos, others, other_photos), fit_found(found, photos, misled, other_photos)
+    assert kept is not None and kept.look_share > 0.5
+    assert dropped is not None and dropped.look_share == 0.0
+
+
 @pytest.mark.parametrize("gain", [-0.1, 0.0, 0.1])
 def test_a_look_without_a_gain_in_precision_has_no_share(gain: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Likelihood wants a share of this look; precision decides, and without one the other weight is the look's absence's."""
     precision = iter([0.5, 0.5 + gain])
     monkeypatch.setattr(photograph_fit, "mean_precision", lambda *_: next(precision))
     found, photos = drawn(600, True, seed=3)
-    fit = fit_found(found, photos)
+    fit = fit_found(found, photos, *drawn(60, True, seed=4))
     assert fit is not None and (fit.map50_without_look, fit.map50_with_look) == (0.5, 0.5 + gain)
     assert (fit.look_share > 0.3) == (gain > 0)
     if gain <= 0:
@@ -88,7 +99,7 @@ def test_what_is_not_labelled_is_not_judged() -> None:
     assert counted.tolist() == [True, False, True]  # nobody says that there is no second kind in the second photograph
     assert right.tolist() == [True, False, True] and category.tolist() == [0, -1, 1]
     assert mean_precision(found, photos, own) == 1.0
-    assert fit_found(found, photos) is None  # too few
+    assert fit_found(found, photos, found, photos) is None  # too few
 
 
 def test_a_resumed_run_does_not_look_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, single_precision: None) -> None:
@@ -105,12 +116,12 @@ def test_a_resumed_run_does_not_look_again(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(trainer, "read_photographs", lambda *_, **__: [p for p in drawn(600, True)[1] for _ in range(3)])
     first = trainer.fit_photographs(model, config)
     fitted = model.guide.fusion.photograph.detach().clone()
-    assert calls == [1] and fitted.tolist() == pytest.approx(
+    assert calls == [1, 1] and fitted.tolist() == pytest.approx(
         [first[k] for k in ("factor", "shift", "label_factor", "look_share")]
     )
     with torch.no_grad():
         model.guide.fusion.photograph.zero_()
-    assert trainer.fit_photographs(model, config) == first and calls == [1]
+    assert trainer.fit_photographs(model, config) == first and calls == [1, 1]
     assert torch.equal(model.guide.fusion.photograph, fitted)
 
 
@@ -124,7 +135,7 @@ def test_detections_are_found_as_they_are(tmp_path: Path, single_precision: None
     assert len(found.scene) > 0 and set(found.scene.tolist()) <= {0, 1} and (found.log_odds >= photograph_fit.MIN_ODDS).all()
     np.testing.assert_allclose(np.exp(found.own).sum(1), 1.0, rtol=1e-6)
     assert np.isfinite(found.look).all()
-    fit = fit_found(*drawn(600, True))
+    fit = fit_found(*drawn(600, True), *drawn(600, True))
     assert fit is not None
     adopt_fit(model, fit)
     assert float(model.guide.fusion.photograph[0]) == pytest.approx(fit.factor)

@@ -190,6 +190,9 @@ def folded_guide(guide: Guide, dtype: torch.dtype) -> Guide:
         fast._modules["shape_look"] = look
     if isinstance(guide, HybridGuide):
         fast._modules["detector"] = folded_detector(guide.detector)
+        scene = copy.copy(guide.scene)
+        scene._modules = {**guide.scene._modules, "encoder": FoldedEncoder(guide.scene.encoder, dtype)}
+        fast._modules["scene"] = scene
     return fast
 
 

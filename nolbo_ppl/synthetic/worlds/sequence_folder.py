@@ -25,14 +25,14 @@ from nolbo_ppl.io.images import open_image
 from nolbo_ppl.io.npz import save_npz
 from nolbo_ppl.io.output_folder import contents, locked, sweep
 from nolbo_ppl.io.trajectories import Trajectory, write_trajectory
-from nolbo_ppl.synthetic.dataset_writer import write_missing
+from nolbo_ppl.synthetic.dataset_writer import DRIVE, SCENES, write_missing
 from nolbo_ppl.synthetic.worlds.world import World, make_world
 from nolbo_ppl.synthetic.worlds.world_config import SequenceConfig
 from nolbo_ppl.synthetic.worlds.world_frame import render_frame
 
 CHUNK = 8
 """Frames that one job renders."""
-DRIVE, SCENES, OBJECTS, TRUTH, TIMES = "drive.json", "scenes.jsonl", "objects.json", "truth.txt", "times.txt"
+OBJECTS, TRUTH, TIMES = "objects.json", "truth.txt", "times.txt"
 INTRINSICS, VOXELS = "intrinsics.json", "voxels.npz"
 LAYOUT = 1
 """Version of the worlds: a folder of another one cannot be resumed, since its frames show another world."""

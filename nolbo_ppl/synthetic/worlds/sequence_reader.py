@@ -21,7 +21,8 @@ from nolbo_ppl.io.scenes import image_field, parse_record
 from nolbo_ppl.io.text import read_times
 from nolbo_ppl.io.trajectories import read_trajectory
 from nolbo_ppl.structures.annotations import Annotations
-from nolbo_ppl.synthetic.worlds.sequence_folder import DRIVE, INTRINSICS, OBJECTS, SCENES, TIMES, TRUTH, VOXELS, read_image
+from nolbo_ppl.synthetic.dataset_writer import DRIVE, SCENES
+from nolbo_ppl.synthetic.worlds.sequence_folder import INTRINSICS, OBJECTS, TIMES, TRUTH, VOXELS, read_image
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,8 @@ def compared(found: dict[str, np.ndarray], expected: ObjectPosteriors) -> int:
         row = int(distance.argmin())
         if distance[row] > 1e-3:
             continue  # below CANDIDATE
+        if np.ptp(np.sort(expected.class_log_posterior[row])[-2:]) < 1e-4:
+            continue  # of two categories either is the likeliest
         matched += 1
         for name in OUTPUTS[2:]:
             if name.startswith("azimuth"):
