@@ -27,7 +27,7 @@ from nolbo_ppl.progress import progress_bar
 
 PARTS = 3
 """Of labelled photographs, every third from the first is fitted on, every third from the second measured; the rest decide whether
-the RoI refinement has a share in the category."""
+the RoI refinement has a share in the category, and objectness is fitted on them too."""
 MIN_SIDE = 24.0
 """Longer side, px, from which on an object counts (as in `nolbo_ppl.evaluation.photograph_scores`)."""
 MIN_ODDS = -4.6
@@ -64,6 +64,7 @@ class PhotographFit:
     """Weight of the RoI refinement's log probabilities."""
     photographs: int
     detections: int
+    """Behind factor and shift: those of the others too."""
     map50_without_look: float
     """Mean average precision, on photographs that decide."""
     map50_with_look: float
@@ -144,13 +145,16 @@ def fit_found(
     Args:
         found: detections to fit on.
         photos: their photographs.
-        others: detections that decide whether the look has a share.
+        others: detections that decide whether the look has a share; factor and shift are fitted on both.
         other_photos: theirs.
     """
     counted, right, category = judged(found, photos, found.own.argmax(1))
+    more, more_right, _ = judged(others, other_photos, others.own.argmax(1))
     if min(int((counted & right).sum()), int((counted & ~right).sum())) < MIN_DETECTIONS:
         return None
-    factor, shift = _logistic(found.log_odds[counted], right[counted])
+    factor, shift = _logistic(
+        np.concatenate((found.log_odds[counted], others.log_odds[more])), np.concatenate((right[counted], more_right[more]))
+    )
     objects = category >= 0
     own, look, truth = found.own[objects], found.look[objects], category[objects]
     plain = _temperatures(own, np.zeros_like(look), truth)[0]
@@ -161,7 +165,7 @@ def fit_found(
     )
     if not with_look > without:
         label_factor, share = plain, 0.0
-    return PhotographFit(factor, shift, label_factor, share, len(photos), int(counted.sum()), without, with_look)
+    return PhotographFit(factor, shift, label_factor, share, len(photos), int(counted.sum() + more.sum()), without, with_look)
 
 
 @torch.no_grad()
