@@ -51,7 +51,7 @@ class GridDoubling:
         return doubled
 
 
-def windows(grid: Float[Tensor, "n v v v c"], inside: tuple[bool, ...], step: int) -> Float[Tensor, "..."]:
+def windows(grid: Float[Tensor, "n v v v c"], inside: tuple[bool, ...], step: int) -> Float[Tensor, "*kinds windows cells c"]:
     """View of a grid as windows of one kind: ends, then grids and their windows in order, then cells of a window, channels.
 
     Args:
