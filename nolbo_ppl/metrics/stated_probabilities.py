@@ -127,8 +127,13 @@ def debiased_calibration_error(confidence: Float[np.ndarray, " n"], outcome: Out
     return float(np.sqrt(max(np.sum((count * square)[use]) / total, 0.0))) if total else float("nan")
 
 
+def _or_none(value: float) -> float | None:
+    """A number as JSON holds it: None where there is none."""
+    return value if np.isfinite(value) else None
+
+
 def probability_record(stated: Float[np.ndarray, " n"], happened: Outcomes) -> dict[str, Any]:
-    """All of this for one kind of probability, as JSON holds it.
+    """All of this for one kind of probability, as JSON holds it; what so few cases do not tell is None.
 
     Example:
         >>> p = np.repeat([0.2, 0.8], 100)
@@ -147,10 +152,10 @@ def probability_record(stated: Float[np.ndarray, " n"], happened: Outcomes) -> d
         "happened": float(y.mean()),
         "log_score": log_score(p, y),
         "brier": float(np.mean((p - y) ** 2)),
-        "gap": reliability_gap(bins),
+        "gap": _or_none(reliability_gap(bins)),
         "calibration_error": float(expected_calibration_error(p, y > 0.5)[0]),
         "calibration_error_if_perfect": float(null.mean()),
-        "debiased_error": debiased_calibration_error(p, y > 0.5),
+        "debiased_error": _or_none(debiased_calibration_error(p, y > 0.5)),
         "bins": [[b.stated, b.happened, b.count] for b in bins],
     }
 
@@ -186,7 +191,7 @@ def region_record(
         return {"count": 0}
     out: dict[str, Any] = {"count": len(mass)}
     if squared is not None:
-        out["nees"] = float(np.mean(np.asarray(squared)[known]) / degrees)
+        out["nees"] = _or_none(float(np.mean(np.asarray(squared)[known]) / degrees))
     out["coverage"] = coverages(mass)
     out["pit"] = (np.histogram(mass, bins=10, range=(0.0, 1.0))[0] / len(mass)).tolist()
     out["distance_from_uniform"] = float(kstest(mass, "uniform").statistic)

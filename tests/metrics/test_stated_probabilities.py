@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,9 @@ def test_record_of_probabilities_and_what_is_none() -> None:
     assert record["gap"] < 0.1 and record["calibration_error"] < 2 * record["calibration_error_if_perfect"]
     assert record["brier"] == pytest.approx(1 / 6, abs=0.02) and sum(b[2] for b in record["bins"]) == 4000
     assert probability_record(p[:0], np.zeros(0, dtype=bool)) == {"count": 0}
+    single = probability_record(np.array([0.7]), np.array([True]))  # one detection in a whole folder
+    assert single["debiased_error"] is None and single["count"] == 1
+    json.dumps([single, region_record(np.array([0.5]), np.array([np.inf]))], allow_nan=False)
     with pytest.raises(InputError, match=r"\[0, 1\]"):
         log_score(np.array([1.1]), np.array([True]))
     with pytest.raises(InputError, match="one outcome for each"):
