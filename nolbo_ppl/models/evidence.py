@@ -156,9 +156,9 @@ class Fusion(nn.Module):
 
     On photographs a region says what the detector says, up to a factor and a shift of its log odds and a factor of its log
     probabilities: what more was learnt from a few thousand of them ranked detections worse (average precision of COCO .34
-    against .53), and shifts by category and size, fitted on photographs of single objects, were wrong in streets. On
-    generated scenes, which the detector does not know, a small network weighs what the two sources state. It sees no features
-    of theirs: of a few dozen backgrounds it would learn those by heart. The image itself says which of the two it is.
+    against .53), and shifts by category and size were wrong in streets. On generated scenes, which the detector does not know,
+    a small network weighs what the two sources state. It sees no features of theirs: of a few dozen backgrounds it would learn
+    those by heart. The image itself says which of the two it is.
 
     Args:
         context: numbers that describe an image as a whole.

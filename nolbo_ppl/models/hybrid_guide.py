@@ -117,7 +117,7 @@ class HybridGuide(Guide):
         levels, factor = one.levels, None
         if detail is not None:
             levels, factor = image_levels(normalise_image(detail.image, logit.dtype)), detail.factor
-        nothing = logit.new_zeros(len(image), 0, 0)
+        nothing = logit.new_zeros(len(image), 0, 0)  # no features of cells: objects are looked at cut out
         whole = (nothing, logit, one.rows, one.columns, (), shift, generated)
         return HybridEncoding(*whole, levels, factor, fused=fused, box=box)
 
